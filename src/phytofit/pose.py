@@ -1,0 +1,189 @@
+"""The start pose: where the stem stands in the cloud, which way is up, and on which side the leaf is.
+
+ICP is only local, so the paper's authors rotate each cloud by hand to the model's orientation.  Here the cloud may lie
+in any orientation.  Everything is computed from distances and inner products of the points, taken in the order in
+which they are stored: a rotated copy of a cloud gets the rotated pose.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phytofit.errors import NoPhytomerError
+
+__all__ = ["StartPose", "start_poses"]
+
+FloatArray = NDArray[np.float64]
+N_POINTS = 2000  # of the cloud, evenly by index: enough to see a stem by
+N_SEEDS = 160
+N_LINES = 2  # different lines that are handed on
+LEAST_ROUNDNESS = (
+    0.3  # thin over wide of a section: a blade in 0.5 cm of noise reaches about 0.4, a stem 0.7 to 1
+)
+MAX_TILT_COSINE = 0.34  # with `up` given, a stem leans by less than 70 degrees
+
+
+@dataclass(frozen=True)
+class StartPose:
+    """A rigid pose to start the search from, and what was seen of the stem.
+
+    ``pose`` (4, 4) maps the model's directions to the cloud's (+z up the stem, +x to the leaf's side) and has the place
+    where the leaf joins the stem's axis as its origin, cm.  ``foot`` and ``top`` are heights of the stem's ends from
+    there, ``radius`` the stem's, cm; ``score`` the length of line that looks like a stem, cm, weighted by roundness.
+    """
+
+    pose: FloatArray
+    foot: float
+    top: float
+    radius: float
+    score: float
+
+
+def start_poses(points: FloatArray, stem_radius: float, *, up: FloatArray | None = None) -> list[StartPose]:
+    """Candidate start poses, most stem-like first: of each of a few lines both directions, or the one that is up.
+
+    Parameters
+    ----------
+    points : (n, 3) cm, cleaned
+    stem_radius : the largest that is expected, cm
+    up : (3,) the upward direction where known
+
+    Raises NoPhytomerError where no line of the cloud has round sections along it, or nothing sticks out beside it.
+    """
+    sample = points[np.linspace(0, len(points) - 1, min(len(points), N_POINTS)).astype(int)]
+    lines = _lines(sample, stem_radius)
+    found = []
+    for center, axis in lines:
+        for sign in (1.0, -1.0):
+            direction = sign * axis
+            if up is not None and direction @ up < MAX_TILT_COSINE * np.linalg.norm(up):
+                continue
+            start = _pose_on_line(sample, center, direction, stem_radius)
+            if start is not None:
+                found.append(start)
+    if not found:
+        raise NoPhytomerError(
+            "no stem with a leaf was found: expected a straight piece with round sections and a leaf beside it"
+            + (", rising along the stated up" if up is not None else "")
+        )
+    return found
+
+
+def _sections(
+    points: FloatArray, center: FloatArray, axis: FloatArray, radius: float
+) -> tuple[FloatArray, ...]:
+    """Sections of the points around a line, each half a radius high: height, count, roundness, offset, spread."""
+    along = (points - center) @ axis
+    across = points - center - along[:, np.newaxis] * axis
+    near = np.einsum("ij,ij->i", across, across) < radius**2
+    along, across = along[near], across[near]
+    step = 0.5 * radius
+    if len(along) < 6:
+        empty = np.zeros(0)
+        return empty, empty, empty, empty, empty
+    first = np.floor(along.min() / step)
+    section = (np.floor(along / step) - first).astype(int)
+    n = int(section.max()) + 1
+    count = np.bincount(section, minlength=n).astype(float)
+    safe = np.maximum(count, 1.0)
+    mean = np.stack([np.bincount(section, across[:, a], n) for a in range(3)], axis=1) / safe[:, np.newaxis]
+    centered = across - mean[section]
+    cov = np.empty((n, 3, 3))
+    for a in range(3):
+        for b in range(3):
+            cov[:, a, b] = np.bincount(section, centered[:, a] * centered[:, b], n) / safe
+    values = np.linalg.eigvalsh(cov)  # the first is 0: along the line
+    roundness = np.sqrt(np.maximum(values[:, 1], 0.0) / np.maximum(values[:, 2], 1e-12))
+    height = (first + np.arange(n) + 0.5) * step
+    spread = np.sqrt(np.maximum(values[:, 1] + values[:, 2], 0.0))
+    return height, count, np.where(count >= 5, roundness, 0.0), np.linalg.norm(mean, axis=1), spread
+
+
+def _stem_score(points: FloatArray, center: FloatArray, axis: FloatArray, radius: float) -> float:
+    """Length of the line that looks like a stem: round, centred, with no long gaps; weighted by roundness."""
+    height, count, roundness, offset, _ = _sections(points, center, axis, radius)
+    if len(height) == 0:
+        return 0.0
+    worth = np.clip(roundness - LEAST_ROUNDNESS, 0.0, None) * np.clip(1.0 - 2.0 * offset / radius, 0.0, None)
+    worth = np.where(count > 0, worth, -0.3)
+    best = run = 0.0
+    for value in np.where(worth > 0, worth, -0.15):  # the best run, in which a few poor sections are forgiven
+        run = max(run + value, 0.0)
+        best = max(best, run)
+    return best * 0.5 * radius
+
+
+def _lines(points: FloatArray, radius: float) -> list[tuple[FloatArray, FloatArray]]:
+    """The few most stem-like lines: points on them and unit directions."""
+    seeds = points[np.linspace(0, len(points) - 1, min(len(points), N_SEEDS)).astype(int)]
+    lines = []
+    for seed in seeds:
+        center, axis = seed, None
+        for reach in (2.0 * radius, 2.5 * radius, 4.0 * radius, 6.0 * radius, 6.0 * radius):
+            offset = points - center
+            if axis is None:
+                near = np.einsum("ij,ij->i", offset, offset) < reach**2
+            else:
+                along = offset @ axis
+                across2 = np.einsum("ij,ij->i", offset, offset) - along**2
+                near = (across2 < radius**2) & (np.abs(along) < reach)
+            if near.sum() < 10:
+                break
+            center = points[near].mean(axis=0)
+            deviation = points[near] - center
+            axis = np.linalg.eigh(deviation.T @ deviation)[1][:, 2]
+        else:
+            assert axis is not None
+            lines.append((_stem_score(points, center, axis, radius), center, axis))
+    lines.sort(key=lambda line: -line[0])
+    kept: list[tuple[FloatArray, FloatArray]] = []
+    for score, center, axis in lines:
+        if score <= 0 or len(kept) == N_LINES or score < 0.3 * lines[0][0]:
+            break
+        if all(_differ(center, axis, other, direction, radius) for other, direction in kept):
+            # the sign of an eigenvector is arbitrary: take it from the points, so that it turns with them
+            kept.append((center, axis if (points.mean(axis=0) - center) @ axis >= 0 else -axis))
+    return kept
+
+
+def _differ(c0: FloatArray, a0: FloatArray, c1: FloatArray, a1: FloatArray, radius: float) -> bool:
+    if abs(a0 @ a1) < np.cos(np.deg2rad(20.0)):
+        return True
+    gap = (c1 - c0) - ((c1 - c0) @ a0) * a0
+    return float(np.linalg.norm(gap)) > radius
+
+
+def _pose_on_line(
+    points: FloatArray, center: FloatArray, axis: FloatArray, radius: float
+) -> StartPose | None:
+    """The pose that has the stem on this line: refined axis, ends of the stem, collar and leaf side."""
+    _, count, roundness, offset, spread = _sections(points, center, axis, radius)
+    stemlike = (roundness > LEAST_ROUNDNESS) & (offset < 0.5 * radius) & (count >= 5)
+    if stemlike.sum() < 2:
+        return None
+    stem_radius = float(np.median(spread[stemlike]))  # of a ring, the radius; of a disc, 0.7 of it
+    along = (points - center) @ axis
+    across = points - center - along[:, np.newaxis] * axis
+    distance = np.linalg.norm(across, axis=1)
+    on_stem = distance < min(1.6 * stem_radius + 0.1 * radius, radius)
+    ends = np.quantile(along[on_stem], [0.01, 0.99])
+    inside = (along > ends[0] - radius) & (along < ends[1] + radius)
+    leaf = distance > 1.6 * stem_radius + 0.25 * radius
+    if leaf.sum() < max(20, 0.05 * len(points)):
+        return None
+    side = across[leaf].sum(axis=0)
+    beside = leaf & inside & (distance < stem_radius + 2.0 * radius)
+    if beside.sum() < 5:  # the leaf's base is hidden: take what is nearest to the stem
+        order = np.argsort(distance[leaf], kind="stable")[: max(5, leaf.sum() // 10)]
+        beside = np.flatnonzero(leaf)[order]
+    collar = float(np.clip(np.median(along[beside]), ends[0], ends[1]))
+    side -= (side @ axis) * axis
+    if np.linalg.norm(side) < 1e-9:
+        return None
+    x = side / np.linalg.norm(side)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(axis, x), axis], axis=1)
+    pose[:3, 3] = center + collar * axis
+    score = float(_stem_score(points, center, axis, radius))
+    return StartPose(pose, float(ends[0]) - collar, float(ends[1]) - collar, stem_radius, score)

@@ -1,0 +1,113 @@
+"""Simulated phytomers: true organs to a cloud, with noise, removed spheres, outliers and a random pose."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phytofit.errors import SettingError
+from phytofit.models import Organ, SurfaceSampler, move
+from phytofit.species import Species, load_species
+
+__all__ = ["SimulatedPhytomer", "add_noise", "add_outliers", "occlude", "random_pose", "simulate"]
+
+FloatArray = NDArray[np.float64]
+OUTLIER_MARGIN = 0.25  # outliers fill the cloud's box, grown by this share of its size
+
+
+@dataclass(frozen=True)
+class SimulatedPhytomer:
+    """A cloud with its truth: ``points`` (n, 3) cm, ``labels`` (n,) 1 stem, 2 leaf, 0 outlier; ``x`` (k,); ``organs``
+    in the cloud's frame; ``pose`` (4, 4) from the model's frame to the cloud's."""
+
+    points: FloatArray
+    labels: NDArray[np.int64]
+    x: FloatArray
+    organs: tuple[Organ, ...]
+    pose: FloatArray
+
+
+def simulate(
+    species: Species | None = None,
+    *,
+    x: ArrayLike | None = None,
+    n_points: int = 5000,
+    noise_cm: float = 0.5,
+    n_spheres: int = 0,
+    sphere_diameter_cm: float = 6.0,
+    outlier_share: float = 0.0,
+    random_orientation: bool = True,
+    seed: int = 0,
+) -> SimulatedPhytomer:
+    """Draw a phytomer from the species' ranges, or build the given one, and scan it.
+
+    Defaults are the paper's simulated protocol (section V); `n_spheres` of `sphere_diameter_cm` are its occlusions
+    (Fig. 7).  `x` (k,) are parameters in the order of the species' space.  `n_points` are drawn before spheres are
+    removed; `outlier_share` of the points that are left is added.
+    """
+    species = load_species() if species is None else species
+    for name, value, low in (("points", n_points, 1), ("noise", noise_cm, 0), ("spheres", n_spheres, 0)):
+        if not (np.isfinite(value) and value >= low):
+            raise SettingError(f"{name}: expected a number of {low} or more, got {value:g}")
+    if not (np.isfinite(sphere_diameter_cm) and sphere_diameter_cm > 0):
+        raise SettingError(f"sphere diameter: expected a positive number of cm, got {sphere_diameter_cm:g}")
+    if not 0 <= outlier_share < 1:
+        raise SettingError(f"outliers: expected a share from 0 to below 1, got {outlier_share:g}")
+    random = np.random.default_rng(seed)
+    if x is None:
+        x = random.uniform(species.ranges[:, 0], species.ranges[:, 1])
+    x = np.asarray(x, float)
+    space = species.space
+    if x.shape != (len(space),) or not np.all((x >= space.lower) & (x <= space.upper)):
+        raise SettingError(
+            f"parameters: expected {len(space)} numbers within the species' bounds "
+            f"({', '.join(space.names)}), got {x.tolist()}"
+        )
+    organs: tuple[Organ, ...] = tuple(o.row(0) for o in species.model.organs(x))
+    points, organ = SurfaceSampler(n_points, int(random.integers(2**31))).draw(organs)
+    labels = organ.astype(np.int64) + 1
+    shuffle = random.permutation(n_points)  # a sensor's points come in no order of the model's
+    points, labels = points[shuffle], labels[shuffle]
+    points = add_noise(points, noise_cm, random)
+    for _ in range(n_spheres):
+        keep = occlude(points, sphere_diameter_cm, random)
+        points, labels = points[keep], labels[keep]
+    outliers = add_outliers(points, outlier_share, random)
+    points = np.concatenate([points, outliers])
+    labels = np.concatenate([labels, np.zeros(len(outliers), np.int64)])
+    pose = random_pose(random) if random_orientation else np.eye(4)
+    points = points @ pose[:3, :3].T + pose[:3, 3]
+    return SimulatedPhytomer(points, labels, x, move(organs, pose), pose)
+
+
+def add_noise(points: FloatArray, std_cm: float, random: np.random.Generator) -> FloatArray:
+    """Points (n, 3) with independent Gaussian noise of zero mean on each coordinate."""
+    return points + random.normal(0.0, std_cm, points.shape)
+
+
+def occlude(points: FloatArray, diameter_cm: float, random: np.random.Generator) -> NDArray[np.bool_]:
+    """Mask (n,) of the points that stay when a sphere around a random point of the cloud is removed (Fig. 7)."""
+    center = points[random.integers(len(points))]
+    stay: NDArray[np.bool_] = np.linalg.norm(points - center, axis=1) > 0.5 * diameter_cm
+    return stay
+
+
+def add_outliers(points: FloatArray, share: float, random: np.random.Generator) -> FloatArray:
+    """`share` times as many points (m, 3) as there are, uniform in the cloud's box and somewhat around it."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = OUTLIER_MARGIN * (high - low)
+    return random.uniform(low - margin, high + margin, (round(share * len(points)), 3))
+
+
+def random_pose(random: np.random.Generator, reach_cm: float = 50.0) -> FloatArray:
+    """Rigid pose (4, 4): a uniform rotation (Shoemake 1992) and a translation within `reach_cm` a coordinate."""
+    q = random.standard_normal(4)
+    w, a, b, c = q / np.linalg.norm(q)
+    pose = np.eye(4)
+    pose[:3, :3] = [
+        [1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)],
+        [2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)],
+        [2 * (a * c - w * b), 2 * (b * c + w * a), 1 - 2 * (a * a + b * b)],
+    ]
+    pose[:3, 3] = random.uniform(-reach_cm, reach_cm, 3)
+    return pose

@@ -1,0 +1,127 @@
+"""Species as data: a TOML file gives the model, its constants and the prior of its parameters."""
+
+import tomllib
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+
+from phytofit.errors import SettingError, SpeciesError
+from phytofit.models.phytomer import Phytomer
+from phytofit.parameters import Parameter, ParameterSpace
+
+__all__ = ["Species", "load_species", "species_names"]
+
+
+@dataclass(frozen=True)
+class Species:
+    """A plant species (or cultivar) as the fit sees it.
+
+    ``space`` is the prior of the model's parameters; ``ranges`` (k, 2) what a simulation draws from, uniformly.
+    """
+
+    name: str
+    model: Phytomer
+    space: ParameterSpace
+    ranges: NDArray[np.float64]
+
+
+class _Constants(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    n_pieces: Annotated[int, Field(ge=2, le=1000)] = 30
+    widest_share: Annotated[float, Field(ge=0, lt=1)] = 0.5
+    slow_share: Annotated[float, Field(ge=0, le=1)] = 0.2
+    concavity: Annotated[float, Field(ge=1, le=3)] = 2.0
+
+
+class _Parameter(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    unit: str
+    mean: FiniteFloat
+    std: Annotated[FiniteFloat, Field(gt=0)]
+    lower: FiniteFloat | None = None
+    upper: FiniteFloat | None = None
+    range: tuple[FiniteFloat, FiniteFloat]
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    name: Annotated[str, Field(min_length=1)]
+    model: Literal["phytomer"]
+    constants: _Constants = _Constants()
+    parameters: dict[str, _Parameter]
+
+
+def species_names() -> list[str]:
+    """Names of the species that come with phytofit."""
+    return sorted(p.name.removesuffix(".toml") for p in _folder().iterdir() if p.name.endswith(".toml"))
+
+
+def load_species(species: str | Path = "sorghum") -> Species:
+    """Read a species by name, or from a TOML file of the user's.
+
+    The parameters must be those of the model, in any order; the last of the phytomer's, ``stem_length_above``, may be
+    left out.  Raises SpeciesError, which names the file, the key, and what was expected.
+    """
+    if str(species) in species_names():
+        text, where = _folder().joinpath(f"{species}.toml").read_text(encoding="utf-8"), f"{species}.toml"
+    else:
+        text, where = _read(Path(species)), str(species)
+    try:
+        file = _File.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise SpeciesError(f"{where}: not valid TOML: {error}") from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise SpeciesError(f"{where}: {key}: {first['msg']} (got {first['input']!r:.60})") from None
+    return _assemble(file, where)
+
+
+def _folder() -> "resources.abc.Traversable":
+    return resources.files("phytofit") / "species"
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise SpeciesError(
+            f"{path}: can't be read as a species file ({reason}); "
+            f"expected a TOML file, or one of the species {', '.join(species_names())}"
+        ) from None
+
+
+def _assemble(file: _File, where: str) -> Species:
+    known, required = Phytomer.PARAMETERS, Phytomer.PARAMETERS[:6]
+    unknown = sorted(set(file.parameters) - set(known))
+    missing = [name for name in required if name not in file.parameters]
+    if unknown or missing:
+        found = f"unknown {', '.join(unknown)}" if unknown else f"no {', '.join(missing)}"
+        raise SpeciesError(f"{where}: parameters: {found}; the {file.model} has {', '.join(known)}")
+    parameters, ranges = [], []
+    for name, unit in zip(known, Phytomer.UNITS, strict=True):
+        if name not in file.parameters:
+            continue
+        p = file.parameters[name]
+        if p.unit != unit:
+            raise SpeciesError(f"{where}: parameters.{name}.unit: expected {unit!r}, got {p.unit!r}")
+        lower = -np.inf if p.lower is None else p.lower
+        upper = np.inf if p.upper is None else p.upper
+        if not lower <= p.range[0] <= p.range[1] <= upper:
+            raise SpeciesError(
+                f"{where}: parameters.{name}.range: expected two ascending numbers within the bounds "
+                f"[{lower:g}, {upper:g}], got {list(p.range)}"
+            )
+        try:
+            parameters.append(Parameter(name, unit, p.mean, p.std, lower, upper))
+        except SettingError as error:
+            raise SpeciesError(f"{where}: {error}") from None
+        ranges.append(p.range)
+    model = Phytomer(**file.constants.model_dump())
+    return Species(file.name, model, ParameterSpace(parameters), np.array(ranges, float))
