@@ -59,11 +59,14 @@ class PointCloud:
 
     def take(self, index: NDArray[np.bool_] | NDArray[np.integer]) -> "PointCloud":
         """Return the cloud of the points that `index` (boolean mask or integers) picks, in its order."""
-        arrays: dict[str, Any] = {
-            key: getattr(self, key) for key in ("points", "labels", "normals", "colors")
-        }
+        arrays: dict[str, Any] = {key: getattr(self, key) for key in ("points", "labels", "normals", "colors")}
         arrays |= {key: array[index] for key, array in arrays.items() if array is not None}
         return replace(self, **arrays)
+
+    def to_input_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (m, 3), cm, in the unit and the frame that this cloud was read in."""
+        shifted: NDArray[np.float64] = (points + self.offset) / SCALE_CM[self.unit]
+        return shifted
 
     def with_note(self, text: str) -> "PointCloud":
         """Return the same cloud with one more remark."""
@@ -105,7 +108,8 @@ def from_points(
     """
     called = source.name if source else name
     try:
-        xyz = np.array(points, dtype=np.float64)
+        with np.errstate(invalid="ignore"):  # signalling NaNs
+            xyz = np.array(points, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise CloudError(f"{called}: expected points of shape (n, 3), got something else: {error}") from error
     if xyz.ndim != 2 or xyz.shape[1] != 3:
@@ -118,17 +122,14 @@ def from_points(
     xyz = xyz[finite]
     if len(xyz) < MIN_POINTS:
         raise CloudError(
-            f"{called}: found {len(xyz)} points, at least {MIN_POINTS} are needed to fit; "
-            "is this the whole cloud?"
+            f"{called}: found {len(xyz)} points, at least {MIN_POINTS} are needed to fit; is this the whole cloud?"
         )
     if (xyz == xyz[0]).all():
         raise CloudError(f"{called}: all {len(xyz)} points are equal; was it exported with too few digits?")
     across = size_cm(xyz)
     if not math.isfinite(across):
         reach = f"{np.abs(xyz).max():.3g}"
-        raise CloudError(
-            f"{called}: coordinates reach {reach}, expected a plant's size; is the file damaged?"
-        )
+        raise CloudError(f"{called}: coordinates reach {reach}, expected a plant's size; is the file damaged?")
     unit = _checked_unit(called, units, across, plausible_cm)
     xyz *= SCALE_CM[unit]
     offset = np.floor(xyz.min(axis=0)) if np.abs(xyz).max() > FAR_CM else np.zeros(3)
@@ -149,9 +150,7 @@ def from_points(
     return cloud.with_note(note)
 
 
-def remove_outliers(
-    points: NDArray[np.float64], *, n_neighbors: int = 16, std_ratio: float = 4.0
-) -> NDArray[np.bool_]:
+def remove_outliers(points: NDArray[np.float64], *, n_neighbors: int = 16, std_ratio: float = 4.0) -> NDArray[np.bool_]:
     """Return the mask (n,) of the points to keep: statistical outlier removal.
 
     A point of `points` (n, 3), in any unit, is an outlier if its mean distance to its `n_neighbors` nearest
@@ -261,12 +260,13 @@ def _checked_unit(called: str, units: str | None, across: float, plausible_cm: t
 
 
 def _length(value: float) -> str:
-    return f"{value:.1f}" if 1 <= value < 1000 else f"{value:.4g}"
+    return f"{value:.1f}" if 1 <= value < 1000 else f"{value:.0f}" if 1000 <= value < 1e6 else f"{value:.3g}"
 
 
 def _matching(called: str, what: str, array: ArrayLike, finite: NDArray[np.bool_]) -> NDArray[np.float64]:
     try:
-        rows = np.asarray(array, dtype=np.float64)
+        with np.errstate(invalid="ignore"):
+            rows = np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise CloudError(f"{called}: expected numbers as {what}, got something else: {error}") from error
     if rows.shape[:1] != finite.shape:

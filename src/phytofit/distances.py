@@ -114,9 +114,7 @@ def labelled_hausdorff(reference: Reference, mismatch_cm: float = 2.0) -> Distan
             mine = organ == number
             if int(number) in bins_of:
                 columns = np.ascontiguousarray(points[:, mine])
-                forward[mine] = np.minimum(
-                    forward[mine], nearest_distances(bins_of[int(number)], *columns)[0]
-                )
+                forward[mine] = np.minimum(forward[mine], nearest_distances(bins_of[int(number)], *columns)[0])
             same = labels == number
             if same.any():
                 own = make_bins(points[:, mine].T)

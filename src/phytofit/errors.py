@@ -35,9 +35,7 @@ class Status(Enum):
     """How a fit ended; the value is the sentence that is shown and stored."""
 
     CONVERGED = "converged: the mean of the last elite is as good as its members"
-    SPLIT_ELITE = (
-        "did not converge: the last elite is spread over solutions whose mean is worse than they are"
-    )
+    SPLIT_ELITE = "did not converge: the last elite is spread over solutions whose mean is worse than they are"
 
 
 class PhytofitError(Exception):

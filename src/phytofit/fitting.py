@@ -2,19 +2,20 @@
 
 import os
 from collections.abc import Callable
-from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phytofit.cloud import PointCloud, from_points, remove_outliers, size_cm, thin
-from phytofit.distances import DISTANCES, Distance, Reference
+from phytofit.distances import DISTANCES, Reference
 from phytofit.errors import SettingError, Status
 from phytofit.models import Organ, move
 from phytofit.objectives import PaperObjective, Registration
 from phytofit.optimize import CrossEntropy, Generation
+from phytofit.parameters import ParameterSpace
 from phytofit.pose import StartPose, start_poses
 from phytofit.species import Species, load_species
 from phytofit.traits import CHORD_CM, Trait, measure
@@ -23,22 +24,9 @@ __all__ = ["Fit", "fit", "minimise", "parse_up"]
 
 FloatArray = NDArray[np.float64]
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
-PREVIEW_SAMPLES, PREVIEW_GENERATIONS, PREVIEW_POINTS = (
-    120,
-    3,
-    1000,
-)  # the short search that judges a start pose
-SIMILAR_ERROR = (
-    1.25  # start poses whose previews end within this factor of the best are judged by plausibility
-)
-PLAUSIBLE_LEAD = (
-    4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
-)
+PLAUSIBLE_LEAD = 4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
-UP_UNKNOWN = "up and down can't be told apart: both were tried, the better is given; state up if it is known"
-
-Progress = Callable[[str, Generation], None]
-"""Called after each generation with what is being done and what it left."""
+UP_UNKNOWN = "up and down can't be told apart by this leaf: the more plausible is given; state up if it is known"
 
 
 @dataclass(frozen=True)
@@ -94,9 +82,7 @@ class Fit:
     @property
     def elite_std(self) -> dict[str, float]:
         """Spread of each parameter in the last elite; not an error of the estimate."""
-        return dict(
-            zip(self.species.space.names, self._in_units(np.sqrt(np.diag(self.covariance))), strict=True)
-        )
+        return dict(zip(self.species.space.names, self._in_units(np.sqrt(np.diag(self.covariance))), strict=True))
 
 
 def parse_up(up: str | ArrayLike | None) -> FloatArray | None:
@@ -128,9 +114,10 @@ def fit(
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
     random_start: bool = False,
+    stem_above: bool = True,
     seed: int = 0,
     threads: int | None = None,
-    progress: Progress | None = None,
+    progress: Callable[[Generation], None] | None = None,
 ) -> Fit:
     """Fit the species' phytomer model to a cloud of one leaf on its piece of stem.
 
@@ -144,9 +131,12 @@ def fit(
     distance : what is minimised: hausdorff (the paper's), quantile, chamfer, labels
     n_samples, n_points, n_generations : candidates a generation, points a candidate, generations
     elite_fraction, covariance_noise : see :class:`phytofit.CrossEntropy`
-    random_start : start the search from means drawn from the prior (as in Fig. 7d), not from the prior's
+    random_start : start the search from means drawn from the prior (as in Fig. 7d), not from the prior's and, for
+        the stem's lengths, from the start pose
+    stem_above : whether the stem may go on above the leaf; False is the paper's model of six parameters, Eq. (1)
     seed : the same seed gives the same result, with any number of threads
     threads : how many to work with; as many as there are cores by default
+    progress : called after each generation with what it left
 
     Raises InputError (a ValueError) for what can't be used, NoPhytomerError where there is no stem with a leaf.
     """
@@ -160,55 +150,59 @@ def fit(
     direction = parse_up(up)
     species = species if isinstance(species, Species) else load_species(os.fspath(species))
     cloud = cloud if isinstance(cloud, PointCloud) else from_points(cloud, units)
+    if not stem_above:
+        species = species.without("stem_length_above")
     search = partial(
         CrossEntropy,
         species.space,
+        n_samples=n_samples,
+        n_generations=n_generations,
         elite_fraction=elite_fraction,
         covariance_noise=covariance_noise,
-        mean=_random_mean(species, seed) if random_start else None,
         seed=seed,
     )
-    search(n_samples=n_samples, n_generations=n_generations)  # settings are checked before any work is done
+    search()  # checks its settings before any work is done
 
     keep = remove_outliers(cloud.points)
     clean = cloud.take(keep)
     relative = cloud.unit == "none"
     scale = size_cm(clean.points) / _expected_size(species) if relative else 1.0
     starts = start_poses(clean.points / scale, _largest_stem_radius(species), up=direction)
+    mean = _random_mean(species.space, seed) if random_start else _mean_at(starts[0], species.space)
 
+    # the cloud as it looks from the best start pose, rounded: a rotated copy of the cloud gives the same numbers
+    home = starts[0].pose
+    upright = np.round((clean.points / scale - home[:3, 3]) @ home[:3, :3], CANONICAL_DECIMALS)
+    kept = thin(upright, n_points)
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
-        frame = partial(_Frame, clean, scale, species, DISTANCES[distance], seed=seed, executor=executor)
+        objective = PaperObjective(
+            species.model,
+            Reference.of(upright[kept], None if clean.labels is None else _organ_numbers(clean.labels[kept])),
+            starts=[np.round(_rigid_inverse(home) @ start.pose, CANONICAL_DECIMALS) for start in starts],
+            n_points=n_points,
+            distance=DISTANCES[distance],
+            seed=seed,
+            executor=executor,
+        )
+        last = minimise(search(mean=mean), objective, progress)
+        registration, error = objective.register(last.mean)
 
-        def preview(start: StartPose) -> CrossEntropy:
-            short = search(n_samples=min(PREVIEW_SAMPLES, n_samples), n_generations=PREVIEW_GENERATIONS)
-            minimise(short, frame(start, min(PREVIEW_POINTS, n_points)).objective)
-            return short
-
-        chosen, undecided = _choose(starts, [preview(start) for start in starts], species)
-        candidates = []
-        for number, start in enumerate(chosen, start=1):
-            what = "search" if len(chosen) == 1 else f"search {number} of {len(chosen)}"
-            full, framed = search(n_samples=n_samples, n_generations=n_generations), frame(start, n_points)
-            minimise(full, framed.objective, progress and partial(progress, what))
-            candidates.append((*framed.objective.register(full.mean), full, framed))
-    registration, error, full, framed = min(candidates, key=lambda candidate: candidate[1])
-
-    status = Status.CONVERGED if error <= full.history[-1].threshold else Status.SPLIT_ELITE
-    pose = framed.start.pose @ registration.T_target_source
+    status = Status.CONVERGED if error <= last.history[-1].threshold else Status.SPLIT_ELITE
+    pose = home @ registration.T_target_source
     pose[:3, 3] *= scale
-    return Fit(
+    result = Fit(
         species=species,
-        x=full.mean,
-        covariance=full.history[-1].cov,
+        x=last.mean,
+        covariance=last.history[-1].cov,
         pose=pose,
         error=error * scale,
         registration=registration,
-        history=tuple(full.history),
+        history=tuple(last.history),
         status=status,
         seed=seed,
-        reference=clean.points[framed.kept],
-        flags=(UP_UNKNOWN,) * undecided + ((status.value,) if status is Status.SPLIT_ELITE else ()),
-        notes=(*cloud.notes, *_what_was_left_out(len(cloud), len(clean), len(framed.kept))),
+        reference=clean.points[kept],
+        flags=(status.value,) if status is Status.SPLIT_ELITE else (),
+        notes=(*cloud.notes, *_what_was_left_out(len(cloud), len(clean), len(kept))),
         method=method,
         relative=relative,
         scale=scale,
@@ -221,9 +215,11 @@ def fit(
             "elite_fraction": elite_fraction,
             "covariance_noise": covariance_noise,
             "random_start": random_start,
+            "stem_above": stem_above,
             "up": None if direction is None else direction.tolist(),
         },
     )
+    return _right_way_up(result, direction)
 
 
 def minimise(
@@ -240,66 +236,49 @@ def minimise(
     return search
 
 
-class _Frame:
-    """The cloud seen from one start pose: upright, thinned there, with the objective on it."""
+def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
+    """The result or its twin that is upside down: the same organs, so that no cloud can tell which is right.
 
-    def __init__(
-        self,
-        cloud: PointCloud,
-        scale: float,
-        species: Species,
-        distance: Callable[[Reference], Distance],
-        start: StartPose,
-        n_points: int,
-        *,
-        seed: int,
-        executor: Executor,
-    ) -> None:
-        self.start = start
-        upright = (cloud.points / scale - start.pose[:3, 3]) @ start.pose[:3, :3]
-        upright = np.round(upright, CANONICAL_DECIMALS)
-        self.kept = thin(upright, n_points)
-        # labels count 0 unknown, 1 stem, 2.. leaves; organs 0 stem, 1 leaf, -1 unknown
-        organ = None if cloud.labels is None else np.clip(cloud.labels[self.kept] - 1, -1, 1).astype(np.int8)
-        self.objective = PaperObjective(
-            species.model,
-            Reference.of(upright[self.kept], organ),
-            n_points=n_points,
-            distance=distance,
-            seed=seed,
-            executor=executor,
-        )
-
-
-def _choose(
-    starts: list[StartPose], previews: list[CrossEntropy], species: Species
-) -> tuple[list[StartPose], bool]:
-    """The start pose to search from, by short searches from each; or two, and True, if up and down look alike.
-
-    Of the poses that fit about as well as the best, the one counts whose leaf is most plausible: leaves leave the
-    stem upwards and bend down.
+    Where `up` (3,) is not known, the one counts whose leaf is the more plausible by the prior: leaves leave the stem
+    upwards and bend down.  If neither is clearly so, a flag says it.
     """
-    errors = np.array(
-        [np.mean([preview.history[-1].threshold, preview.history[-1].best_error]) for preview in previews]
+    space = result.species.space
+    if "stem_length_above" not in space.names:
+        return result
+    turn, offset, pose = result.species.model.upside_down(result.x)
+    pose[:3, 3] *= result.scale
+    twin = replace(
+        result,
+        x=turn @ result.x + offset,
+        covariance=turn @ result.covariance @ turn.T,
+        pose=result.pose @ pose,
+        history=tuple(
+            replace(g, mean=turn @ g.mean + offset, cov=turn @ g.cov @ turn.T, best_x=turn @ g.best_x + offset)
+            for g in result.history
+        ),
     )
-    shape = [species.space.index(name) for name in ("leaf_angle", "leaf_rotate_angle")]
-    surprise = np.array(
-        [
-            np.sum(((preview.mean[shape] - species.space.mean[shape]) / species.space.std[shape]) ** 2)
-            for preview in previews
-        ]
+    if up is not None:
+        return result if result.pose[:3, 2] @ up >= 0.0 else twin
+    shape = [space.index(name) for name in ("leaf_angle", "leaf_rotate_angle")]
+    surprise, surprise_of_twin = (
+        float(np.sum(((it.x[shape] - space.mean[shape]) / space.std[shape]) ** 2)) for it in (result, twin)
     )
-    similar = np.flatnonzero(errors <= SIMILAR_ERROR * errors.min())
-    best = similar[np.argmin(surprise[similar])]
-    rivals = [
-        i
-        for i in similar
-        if starts[i].pose[:3, 2] @ starts[best].pose[:3, 2] < -0.5
-        and surprise[i] - surprise[best] < PLAUSIBLE_LEAD
-    ]
-    if rivals:
-        return [starts[best], starts[min(rivals, key=lambda i: surprise[i])]], True
-    return [starts[best]], False
+    better = twin if surprise_of_twin < surprise else result
+    if abs(surprise - surprise_of_twin) < PLAUSIBLE_LEAD:
+        return replace(better, flags=(*better.flags, UP_UNKNOWN))
+    return better
+
+
+def _rigid_inverse(pose: FloatArray) -> FloatArray:
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+def _organ_numbers(labels: NDArray[np.int64]) -> NDArray[np.int8]:
+    """Labels count 0 unknown, 1 stem, 2.. leaves; organs 0 stem, 1 leaf, -1 unknown."""
+    return np.clip(labels - 1, -1, 1).astype(np.int8)
 
 
 def _what_was_left_out(n_read: int, n_clean: int, n_kept: int) -> list[str]:
@@ -322,7 +301,19 @@ def _expected_size(species: Species) -> float:
     return size_cm(nodes)
 
 
-def _random_mean(species: Species, seed: int) -> FloatArray:
+def _random_mean(space: ParameterSpace, seed: int) -> FloatArray:
     """A start drawn from the prior within its bounds (Fig. 7d)."""
-    drawn: FloatArray = CrossEntropy(species.space, n_samples=2, elite_fraction=0.9, seed=seed).ask()[0]
+    drawn: FloatArray = CrossEntropy(space, n_samples=2, elite_fraction=0.9, seed=seed).ask()[0]
     return drawn
+
+
+def _mean_at(start: StartPose, space: ParameterSpace) -> FloatArray:
+    """The prior's mean, with the stem's lengths as the start pose saw them."""
+    mean = space.mean
+    seen = {"stem_length": -start.foot, "stem_length_above": start.top}
+    if "stem_length_above" not in space.names:
+        seen = {"stem_length": start.top - start.foot}
+    for name, value in seen.items():
+        i = space.index(name)
+        mean[i] = np.clip(value, space.lower[i], space.upper[i])
+    return mean

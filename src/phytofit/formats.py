@@ -4,12 +4,10 @@ Every reader turns bytes into a :class:`Table` of named columns, and :func:`read
 What a file declares about itself is checked against its size before anything is allocated.
 """
 
-import csv
 import io
 import logging
 import re
 import struct
-import warnings
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
@@ -17,12 +15,13 @@ from typing import Any, NamedTuple, TypeAlias
 from uuid import uuid4
 
 import laspy
+import lazrs  # type: ignore[import-untyped]
 import numpy as np
 import pandas as pd
 import pypcd4.pypcd4
 from numpy.typing import NDArray
 
-from phytofit.cloud import SCALE_CM, PointCloud, from_points
+from phytofit.cloud import PointCloud, from_points
 from phytofit.errors import CloudError, OutputError
 
 __all__ = ["READERS", "read_cloud", "write_cloud"]
@@ -91,23 +90,23 @@ def read_cloud(
         raise CloudError(f"{path.name}: the file is empty; was the export interrupted?")
     label_key = _key(label_property)
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
+        with np.errstate(all="ignore"):  # a wrong number is a finding, not a warning
             table = READERS[suffix](data, {*XYZ, *NORMAL, *COLOR, label_key})
             columns = {_key(name): column for name, column in table.columns.items()}
             needed = XYZ if label_property == "label" else (*XYZ, label_property)
             if missing := [name for name in needed if _key(name) not in columns]:
-                raise _FileError(f"no property {_listed(missing)}; found {_listed(table.names)}")
+                raise _FileError(f"no property {', '.join(missing)}, found {table.names}; name them so")
             if sample_faces is not None:
                 columns = _sampled(columns, table.polygons, sample_faces)
+            triples = [names for names in (XYZ, NORMAL, COLOR) if columns.keys() >= {*names}]
+            stacked = {names: np.stack([columns[name] for name in names], axis=1) for names in triples}
     except _FileError as error:
         raise CloudError(f"{path.name}: {error}") from error
-    except Exception as error:  # the libraries raise anything at what they can't read
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # the libraries raise anything, and a panic in lazrs is not even an Exception
         said = " ".join(str(error).split())[:200] or type(error).__name__
         raise CloudError(f"{path.name}: can't be read as {suffix} ({said}); damaged or misnamed?") from error
-    stacked = {
-        n: np.stack([columns[c] for c in n], axis=1) for n in (XYZ, NORMAL, COLOR) if {*n} <= {*columns}
-    }
     return from_points(
         stacked[XYZ],
         "m" if units is None and suffix in (".las", ".laz") else units,
@@ -131,8 +130,7 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
         If the suffix is another one, or the file can't be written there.
     """
     path = Path(path)
-    columns: Columns = {}
-    columns |= zip(XYZ, ((cloud.points + cloud.offset) / SCALE_CM[cloud.unit]).T, strict=True)
+    columns: Columns = dict(zip(XYZ, cloud.to_input_frame(cloud.points).T, strict=True))
     if cloud.labels is not None:
         columns["label"] = cloud.labels.astype(np.int32)
     if cloud.normals is not None:
@@ -145,10 +143,7 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
         kinds = {"f": "double", "i": "int", "u": "uchar"}
         lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
         lines += [f"property {kinds[column.dtype.kind]} {name}" for name, column in columns.items()]
-        content = (
-            "\n".join([*lines, "end_header", ""]).encode()
-            + rows.astype(rows.dtype.newbyteorder("<")).tobytes()
-        )
+        content = "\n".join([*lines, "end_header", ""]).encode() + rows.astype(rows.dtype.newbyteorder("<")).tobytes()
     elif path.suffix.lower() == ".xyz":
         content = frame.to_csv(sep=" ", index=False, lineterminator="\n").encode()
     else:
@@ -178,10 +173,6 @@ def _key(name: str) -> str:
     return ALIASES.get(name.lower(), name.lower())
 
 
-def _listed(names: Collection[str]) -> str:
-    return ", ".join([*names][:20]) or "none"
-
-
 class _Element(NamedTuple):
     n_rows: int
     properties: list[tuple[str, np.dtype[Any], np.dtype[Any] | None]]  # name, type, type of a list's length
@@ -203,7 +194,7 @@ def _read_ply(data: bytes, wanted: Collection[str]) -> Table:
     if body[at:].strip():
         raise _FileError("holds more than its header declares; edited, or sent as text? export it again")
     if "vertex" not in found:
-        raise _FileError(f"no element 'vertex', found {_listed(found)}; is it a point cloud?")
+        raise _FileError(f"no element 'vertex', found {[*found]}; is it a point cloud?")
     columns = {name: rows for name, rows in found["vertex"].items() if isinstance(rows, np.ndarray)}
     faces = found.get("face", {})
     return Table(columns, [*columns], faces.get("vertex_indices", faces.get("vertex_index", ())))
@@ -283,19 +274,21 @@ def _read_pcd(data: bytes, wanted: Collection[str]) -> Table:
         raise _FileError(f"not a PCD file, or truncated: starts with {data[:16]!r}, has no line 'DATA'")
     lines = [line.decode("latin-1").split() for line in data[: end.start()].splitlines()]
     header = {words[0]: words[1:] for words in lines if words}
+    if not {"FIELDS", "SIZE", "TYPE", "POINTS"} <= {key for key, values in header.items() if values}:
+        raise _FileError(f"its PCD header holds {[*header]}, expected FIELDS, SIZE, TYPE and POINTS; export it again")
     fields, sizes, n_points = header["FIELDS"], header["SIZE"], int(header["POINTS"][0])
     counts = header.get("COUNT", ["1"] * len(fields))
     n_bytes = n_points * sum(int(size) * int(count) for size, count in zip(sizes, counts, strict=True))
     body, encoding = data[end.end() :], end[1].decode().lower()
     if encoding == "ascii":  # pypcd4 wants single spaces
         texts = [b" ".join(line.split()) for line in body.splitlines() if line.strip()]
-        body, is_whole = b"\n".join(texts), len(texts) == n_points
+        body, is_whole = b"\n".join(texts), len(texts) == n_points and 8 * len(body) >= n_bytes
     elif encoding == "binary":
         is_whole = len(body) >= n_bytes
     else:  # LZF needs 3 bytes or more for 264
-        n_packed, n_unpacked = struct.unpack_from("<II", body)
+        n_packed, n_unpacked = struct.unpack("<II", body[:8].ljust(8, b"\0"))
         is_whole = len(body) >= 8 + n_packed and 100 * n_packed >= n_unpacked == n_bytes
-    if not is_whole:
+    if not is_whole or n_points == 0:
         raise _FileError(f"truncated: it declares {n_points} points, that is not what follows; copy it again")
     # With a header of our own: pypcd4 insists on COUNT and on version 0.7, and renames fields.
     numbered = " ".join(f"f{i}" for i in range(len(fields)))
@@ -305,7 +298,7 @@ def _read_pcd(data: bytes, wanted: Collection[str]) -> Table:
     rows = np.atleast_1d(pypcd4.pypcd4.PointCloud.from_fileobj(file).pc_data)
     columns = {name: rows[f"f{i}"] for i, name in enumerate(fields) if counts[i] == "1"}
     for packed in columns.keys() & {"rgb", "rgba"}:
-        bits = np.ascontiguousarray(columns.pop(packed)).view(np.uint32)
+        bits = columns.pop(packed).copy().view(np.uint32)
         columns |= {"red": bits >> 16 & 255, "green": bits >> 8 & 255, "blue": bits & 255}
     return Table(columns, fields)
 
@@ -313,32 +306,38 @@ def _read_pcd(data: bytes, wanted: Collection[str]) -> Table:
 def _read_las(data: bytes, wanted: Collection[str]) -> Table:
     if not data.startswith(b"LASF"):
         raise _FileError(f"not a LAS file: it starts with {data[:16]!r}, expected 'LASF'")
-    _check_las_counts(data)
-    try:
-        with laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs) as file:
-            las = file.read()
-    except BaseException as error:  # lazrs panics, and its PanicException is no Exception
-        if type(error).__name__ != "PanicException":
-            raise
-        raise _FileError("damaged: its compressed points can't be read; copy it again") from error
+    n_vlrs, n_evlrs = (struct.unpack_from("<I", data.ljust(375, b"\0"), at)[0] for at in (100, 243))
+    if 54 * n_vlrs + (60 * n_evlrs if data[25] >= 4 else 0) > len(data):
+        raise _FileError(f"damaged: its LAS header declares {n_vlrs} more headers; copy it again")
+    with laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs) as file:
+        if not _holds_points(data, file.header):
+            raise _FileError(f"truncated: it declares {file.header.point_count} points; copy it again")
+        las = file.read()
     names = [*XYZ, *(name for name in las.point_format.dimension_names if name not in ("X", "Y", "Z"))]
     return Table({name: np.asarray(las[name]) for name in names if _key(name) in wanted}, names)
 
 
-def _check_las_counts(data: bytes) -> None:
-    """Compare counts with the size: laspy loops over them, and lazrs aborts Python when memory runs out."""
-    offset, n_vlrs, point_format, point_size, n_points = struct.unpack_from("<IIBHI", data, 96)
-    n_evlrs = 0
-    if data[25] >= 4:
-        n_evlrs, n_points = struct.unpack_from("<IQ", data, 243)
-    n_bytes = offset + n_points * point_size
-    if point_format & 0b11000000:  # compressed; no real point takes less than a bit
-        start = struct.unpack_from("<q", data, offset)[0]
-        start = struct.unpack_from("<q", data, len(data) - 8)[0] if start == -1 else start
-        n_chunks = struct.unpack_from("<I", data, start + 4)[0] if 0 <= start <= len(data) - 8 else len(data)
-        n_bytes = max(offset + n_points // 8, n_chunks * point_size)
-    if max(n_bytes, 54 * n_vlrs, 60 * n_evlrs) > len(data):
-        raise _FileError(f"truncated: it declares {n_points} points, more than it holds; copy it again")
+def _holds_points(data: bytes, header: laspy.LasHeader) -> bool:
+    """Say whether the declared points can be there: lazrs allocates them unseen, and aborts Python if that fails."""
+    at, n_points, n_bytes = header.offset_to_point_data, header.point_count, header.point_format.size
+    if not header.are_points_compressed:
+        return bool(at + n_points * n_bytes <= len(data))
+    table_at = struct.unpack_from("<q", data, at)[0]
+    table_at = struct.unpack_from("<q", data, len(data) - 8)[0] if table_at == -1 else table_at
+    n_chunks = struct.unpack_from("<I", data, table_at + 4)[0]
+    if n_chunks * n_bytes > len(data) or n_points > 8 * len(data):  # no real point takes less than a bit
+        return False
+    vlr = header.vlrs.get("LasZipVlr")[0].record_data
+    source = io.BytesIO(data)
+    source.seek(at)
+    chunks = lazrs.read_chunk_table(source, lazrs.LazVlr(vlr))
+    items = struct.iter_unpack("<3H", vlr[34:])
+    n_layers = sum({10: 9, 11: 1, 12: 2, 13: 1, 14: size}.get(kind, 0) for kind, size, _ in items)
+    at += 8
+    for _ in chunks if n_layers else ():  # a point, the number of points, the sizes of the layers, the layers
+        at += n_bytes + 4
+        at += 4 * n_layers + sum(struct.unpack_from(f"<{n_layers}I", data, at))
+    return bool(at <= len(data) and sum(n for n, _ in chunks) >= n_points)
 
 
 def _read_text(data: bytes, wanted: Collection[str]) -> Table:
@@ -355,6 +354,8 @@ def _read_text(data: bytes, wanted: Collection[str]) -> Table:
     words = [word.strip(" \t\"'") for word in first[0].decode("latin-1").split(separator)]
     if len(words) < 3:
         raise _FileError(f"expected at least 3 columns (x y z), found {len(words)}; is this a 2-D export?")
+    if len(words) > 1000:
+        raise _FileError(f"expected columns x y z and a few more, found {len(words)}; is it a table of points?")
     names, start = words, first.end()
     if all(re.fullmatch(r"(?i)[-+.\de]+|[-+]?(nan|inf)", word) for word in words):
         names, start = [], first.start()
@@ -364,9 +365,7 @@ def _read_text(data: bytes, wanted: Collection[str]) -> Table:
         header=None,
         dtype={i: np.float64 if not names or _key(names[i]) in wanted else str for i in range(len(words))},
         encoding="latin-1",
-        quoting=csv.QUOTE_NONE,
         skipinitialspace=True,
-        float_precision="round_trip",
     )
     names = names or _guessed_names(frame, n_points is not None)
     if len(names) != frame.shape[1]:

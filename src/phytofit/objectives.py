@@ -2,9 +2,10 @@
 
 import heapq
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +19,10 @@ __all__ = ["PaperObjective", "Registration"]
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
+OrganArray = NDArray[np.int8]
+_Round = tuple[int, tuple[int, float, int]]  # every how many-th point; iterations, tolerance, memory
 BLOCK = 10  # candidates that a thread takes at a time
-SHORTLIST = 2  # times the elite's size: so many candidates are tried from the further starts
+SHORTLIST = 2  # times the elite's size: so many candidates go on to the fine round
 
 
 @dataclass(frozen=True)
@@ -36,19 +39,29 @@ class Registration:
     converged: bool
 
 
-def _tilted(degrees: float) -> FloatArray:
-    """Rotation (3, 3) about y: the leaf dips (positive) or lifts."""
-    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
-    return np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+class _Placed(NamedTuple):
+    """A candidate laid on the reference."""
+
+    error: float
+    registration: Registration
+    start: int = 0  # the number of the start that it came from
+
+
+class _Population(NamedTuple):
+    """Candidates ready to be sampled, and where the leaf of each joins the stem's axis, (n, 3)."""
+
+    surfaces: PopulationSurfaces
+    junction: FloatArray
 
 
 class PaperObjective:
     """E(X) of section IV-C: sample the model's surface, align it with ICP, take the distance.
 
-    The reference stands in the start pose: model upright, leaf towards +x, origin where the leaf joins the stem's
-    axis.  ICP begins with the model's own junction there, on every `coarse_stride`-th point, and goes on with all of
-    them; the distance is exact at the pose it ends in.  Where it ends depends on where it begins, so it begins
-    anew with the model tilted by each of `tilts_deg`, and the smallest distance counts.
+    The reference stands upright as seen from one start pose; `starts` (4, 4) each say where the model may begin
+    there: its directions, and the place of its junction of leaf and stem.  ICP goes from coarse to fine: with a few
+    points from every start, with more from where those fitted best, with all at last.  The distance is exact at the
+    pose it ends in.  Where ICP ends depends on where it begins, so the last rounds are run again with the leaf tilted
+    up and down by each of `tilts_deg`, and the smallest distance counts.
 
     Common random numbers: the same x always gets the same points, and so the same error.
     """
@@ -58,106 +71,137 @@ class PaperObjective:
         model: Phytomer,
         reference: Reference,
         *,
+        starts: Sequence[FloatArray] = (np.eye(4),),
         n_points: int = 5000,
         distance: Callable[[Reference], Distance] = hausdorff,
-        coarse_stride: int = 5,
-        coarse_iterations: int = 30,
-        iterations: int = 30,
+        scout_stride: int = 20,
+        scout_iterations: int = 15,
+        coarse_stride: int = 3,
+        coarse_iterations: int = 20,
+        iterations: int = 20,
         tolerance_cm: float = 1e-3,
         memory: int = 5,
-        tilts_deg: tuple[float, ...] = (0.0, 9.0, -9.0),
+        tilts_deg: tuple[float, ...] = (9.0, -9.0),
         seed: int = 0,
         executor: Executor | None = None,
     ) -> None:
         self._model = model
         self._reference = reference
+        self._starts = list(starts)
         self._distance = distance(reference)
         self._sampler = SurfaceSampler(n_points, seed)
-        self._coarse = (coarse_iterations, tolerance_cm, memory)
-        self._fine = (iterations, tolerance_cm, memory)
-        self._stride = coarse_stride
-        self._starts = [_tilted(degrees) for degrees in tilts_deg]
+        self._scout = (scout_stride, (scout_iterations, tolerance_cm, memory))
+        self._coarse = (coarse_stride, (coarse_iterations, tolerance_cm, memory))
+        self._fine = (1, (iterations, tolerance_cm, memory))
+        self._tilts = [_about_y(degrees) for degrees in tilts_deg]
         self._executor = executor
 
     def __call__(self, xs: FloatArray, n_elite: int | None = None) -> FloatArray:
         """Errors (n,) of the candidates xs (n, k), cm.
 
-        Given `n_elite`, only so many of the smallest errors are wanted, and the others come back as ``inf``.  All
-        candidates are then tried from the first start and the best `SHORTLIST` times n_elite from the further ones;
-        and a distance is given up as soon as it is proved larger than that many others.  Neither depends on the
-        number of threads.
+        Given `n_elite`, only so many of the smallest errors are wanted, and the others come back as ``inf``: only the
+        `SHORTLIST` times n_elite candidates that look best after the coarse round go on to the fine one, and a
+        distance is given up as soon as it is proved larger than so many others.  Neither depends on the number of
+        threads.
         """
-        organs = self._model.organs(xs)
-        surfaces, junction = self._sampler.population(organs), organs[1].axis[:, 0]
-        every = range(len(xs))
+        population = self._population(xs)
         if n_elite is None:
-            return self._errors(surfaces, junction, every, self._starts, len(xs))
-        n_short = min(SHORTLIST * n_elite, len(xs))
-        errors = _largest_to_inf(self._errors(surfaces, junction, every, self._starts[:1], n_short), n_short)
-        if len(self._starts) > 1:
-            short = np.flatnonzero(np.isfinite(errors))
-            again = self._errors(surfaces, junction, short.tolist(), self._starts[1:], n_elite)
-            errors[short] = np.minimum(errors[short], again)
-        return _largest_to_inf(errors, min(n_elite, len(xs)))
+            placed = self._in_blocks(range(len(xs)), len(xs), lambda i, limit: self._register(population, i))
+            return np.array([each.error for each in placed])
+        n_short, n_elite = min(SHORTLIST * n_elite, len(xs)), min(n_elite, len(xs))
+        first = self._in_blocks(range(len(xs)), n_short, lambda i, limit: self._roughly(population, i, limit))
+        errors = _largest_to_inf(np.array([placed.error for placed in first]), n_short)
+        short = np.flatnonzero(np.isfinite(errors)).tolist()
+        again = self._in_blocks(short, n_elite, lambda i, limit: self._finely(population, i, first[i], limit))
+        errors[short] = [placed.error for placed in again]
+        return _largest_to_inf(errors, n_elite)
 
     def register(self, x: FloatArray) -> tuple[Registration, float]:
         """The pose of one candidate x (k,), from the model's frame to the reference's, and its error, cm."""
-        organs = self._model.organs(x)
-        surfaces, junction = self._sampler.population(organs), organs[1].axis[:, 0]
-        tries = [self._from_start(surfaces, junction, 0, start, np.inf) for start in self._starts]
-        error, registration = min(tries, key=lambda result: result[0])
-        return registration(), error
+        placed = self._register(self._population(x), 0)
+        return placed.registration, placed.error
 
-    def _errors(
-        self, surfaces: PopulationSurfaces, junction: FloatArray, which: "range | list[int]", starts: list[FloatArray], n: int
-    ) -> FloatArray:  # fmt: skip
-        """Least error over the starts of the candidates `which`; only the n smallest are exact."""
-        level = _Level(n)
+    def _population(self, xs: FloatArray) -> _Population:
+        organs = self._model.organs(xs)
+        return _Population(self._sampler.population(organs), organs[1].axis[:, 0])
 
-        def block(first: int) -> list[float]:
-            errors = []
+    def _register(self, population: _Population, i: int) -> _Placed:
+        return self._finely(population, i, self._roughly(population, i, 0.0), np.inf)
+
+    def _in_blocks(self, which: Sequence[int], n_best: int, place: Callable[[int, float], _Placed]) -> list[_Placed]:
+        """Place the candidates `which` on the executor's threads; only the errors of the n_best are exact."""
+        level = _Level(n_best)
+
+        def block(first: int) -> list[_Placed]:
+            placed = []
             for i in which[first : first + BLOCK]:
-                error = np.inf
-                for start in starts:
-                    error = min(
-                        error, self._from_start(surfaces, junction, i, start, min(error, level.limit))[0]
-                    )
-                level.add(error)
-                errors.append(error)
-            return errors
+                placed.append(place(i, level.limit))
+                level.add(placed[-1].error)
+            return placed
 
         firsts = range(0, len(which), BLOCK)
-        blocks: Iterable[list[float]] = (
+        blocks: Iterable[list[_Placed]] = (
             map(block, firsts) if self._executor is None else self._executor.map(block, firsts)
         )
-        return np.array([error for errors in blocks for error in errors])
+        return [placed for placed_of_block in blocks for placed in placed_of_block]
 
-    def _from_start(
-        self, surfaces: PopulationSurfaces, junction: FloatArray, i: int, start: FloatArray, limit: float
-    ) -> tuple[float, Callable[[], Registration]]:
-        """Error of candidate i with ICP from one start; exact up to `limit`."""
-        points, organ = surfaces.draw(i)
-        grid = self._reference.grid
-        coarse, coarse_mean = _centered(np.ascontiguousarray(points[:, :: self._stride]))
-        r, t, *_ = icp(coarse, grid, start, start @ (coarse_mean - junction[i]), *self._coarse)
-        source, mean = _centered(points)
-        r, t, mse, iterations, converged = icp(source, grid, r, t + r @ (mean - coarse_mean), *self._fine)
-        transform(source, r, t, points)
-        error = self._distance(points, organ, limit)
+    def _roughly(self, population: _Population, i: int, limit: float) -> _Placed:
+        """ICP with a few points from every start, then with more from the best; error exact up to `limit`."""
+        points, organ = population.surfaces.draw(i)
+        junction = population.junction[i]
+        poses = _poses_at(junction, self._starts)
+        scouted = [self._align(points, pose, self._scout).rmse for pose in poses] if len(poses) > 1 else [0.0]
+        start = int(np.argmin(scouted))
+        return self._place(points, organ, poses[start], self._coarse, limit)._replace(start=start)
 
-        def registration() -> Registration:
-            pose = np.eye(4)
-            pose[:3, :3] = r
-            pose[:3, 3] = t - r @ mean
-            return Registration(pose, float(np.sqrt(mse)), int(iterations), bool(converged))
+    def _finely(self, population: _Population, i: int, rough: _Placed, limit: float) -> _Placed:
+        """ICP with all points from where a candidate was placed, and anew from its start with the leaf tilted."""
+        points, organ = population.surfaces.draw(i)
+        start = self._starts[rough.start]
+        best = self._place(points, organ, rough.registration.T_target_source, self._fine, limit)
+        for tilted in _poses_at(population.junction[i], [start @ tilt for tilt in self._tilts]):
+            pose = self._align(points, tilted, self._coarse).T_target_source
+            again = self._place(points, organ, pose, self._fine, min(best.error, limit))
+            best = min(best, again, key=lambda placed: placed.error)
+        return best
 
-        return error, registration
+    def _place(self, points: Float32Array, organ: OrganArray, pose: FloatArray, how: _Round, limit: float) -> _Placed:
+        """ICP from a pose, and the distance of all points where it ends, exact up to `limit`."""
+        registration = self._align(points, pose, how)
+        moved = np.empty_like(points)
+        transform(points, registration.T_target_source[:3, :3], registration.T_target_source[:3, 3], moved)
+        return _Placed(self._distance(moved, organ, limit), registration)
+
+    def _align(self, points: Float32Array, pose: FloatArray, how: _Round) -> Registration:
+        """ICP of every stride-th of the points (3, n) from a pose."""
+        stride, settings = how
+        chosen = points[:, ::stride]
+        mean = chosen.mean(axis=1)
+        source = np.subtract(chosen, mean[:, np.newaxis], order="C")
+        rotation = np.ascontiguousarray(pose[:3, :3])
+        r, t, mse, iterations, converged = icp(
+            source, self._reference.grid, rotation, rotation @ mean + pose[:3, 3], *settings
+        )
+        aligned = np.eye(4)
+        aligned[:3, :3] = r
+        aligned[:3, 3] = t - r @ mean
+        return Registration(aligned, float(np.sqrt(mse)), int(iterations), bool(converged))
 
 
-def _centered(points: Float32Array) -> tuple[Float32Array, FloatArray]:
-    """Points (3, n) about their mean, and the mean (3,)."""
-    mean = points.mean(axis=1)
-    return points - mean[:, np.newaxis], mean.astype(float)
+def _poses_at(junction: FloatArray, starts: Sequence[FloatArray]) -> list[FloatArray]:
+    """Poses (4, 4) of the model's frame that bring its junction (3,) to the origin of each start."""
+    poses = []
+    for start in starts:
+        pose = start.copy()
+        pose[:3, 3] -= start[:3, :3] @ junction
+        poses.append(pose)
+    return poses
+
+
+def _about_y(degrees: float) -> FloatArray:
+    """Pose (4, 4) turned about y: a leaf towards +x dips (positive) or lifts."""
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return np.array([[c, 0.0, s, 0.0], [0.0, 1.0, 0.0, 0.0], [-s, 0.0, c, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def _largest_to_inf(errors: FloatArray, n: int) -> FloatArray:

@@ -80,6 +80,4 @@ class ParameterSpace:
         try:
             return self.names.index(name)
         except ValueError:
-            raise SettingError(
-                f"no parameter is called {name!r}; there are {', '.join(self.names)}"
-            ) from None
+            raise SettingError(f"no parameter is called {name!r}; there are {', '.join(self.names)}") from None

@@ -18,9 +18,9 @@ FloatArray = NDArray[np.float64]
 N_POINTS = 2000  # of the cloud, evenly by index: enough to see a stem by
 N_SEEDS = 160
 N_LINES = 2  # different lines that are handed on
-LEAST_ROUNDNESS = (
-    0.3  # thin over wide of a section: a blade in 0.5 cm of noise reaches about 0.4, a stem 0.7 to 1
-)
+LEAST_SHARE = 0.6  # of the best line's score: a line that looks less like a stem is not handed on
+LEAST_ROUNDNESS = 0.3  # thin over wide of a section: a blade in 0.5 cm of noise reaches about 0.4, a stem 0.7 to 1
+MAX_SLOPE = 2.0  # of a leaf's base, rise over run, when it is followed into the stem
 MAX_TILT_COSINE = 0.34  # with `up` given, a stem leans by less than 70 degrees
 
 
@@ -30,18 +30,22 @@ class StartPose:
 
     ``pose`` (4, 4) maps the model's directions to the cloud's (+z up the stem, +x to the leaf's side) and has the place
     where the leaf joins the stem's axis as its origin, cm.  ``foot`` and ``top`` are heights of the stem's ends from
-    there, ``radius`` the stem's, cm; ``score`` the length of line that looks like a stem, cm, weighted by roundness.
+    there, ``radius`` the stem's, cm; ``curl`` is negative where the leaf bends down (1/cm); ``score`` the length of
+    line that looks like a stem, cm, weighted by roundness.
     """
 
     pose: FloatArray
     foot: float
     top: float
     radius: float
+    curl: float
     score: float
 
 
 def start_poses(points: FloatArray, stem_radius: float, *, up: FloatArray | None = None) -> list[StartPose]:
-    """Candidate start poses, most stem-like first: of each of a few lines both directions, or the one that is up.
+    """Candidate start poses, most stem-like line first, and of its two directions the one first that looks up.
+
+    Where `up` is known, only directions that rise along it.
 
     Parameters
     ----------
@@ -52,16 +56,13 @@ def start_poses(points: FloatArray, stem_radius: float, *, up: FloatArray | None
     Raises NoPhytomerError where no line of the cloud has round sections along it, or nothing sticks out beside it.
     """
     sample = points[np.linspace(0, len(points) - 1, min(len(points), N_POINTS)).astype(int)]
-    lines = _lines(sample, stem_radius)
     found = []
-    for center, axis in lines:
-        for sign in (1.0, -1.0):
-            direction = sign * axis
-            if up is not None and direction @ up < MAX_TILT_COSINE * np.linalg.norm(up):
-                continue
-            start = _pose_on_line(sample, center, direction, stem_radius)
-            if start is not None:
-                found.append(start)
+    for center, axis in _lines(sample, stem_radius):
+        both = [_pose_on_line(sample, center, direction, stem_radius) for direction in (axis, -axis)]
+        pair = [start for start in both if start is not None]
+        if up is not None:
+            pair = [start for start in pair if start.pose[:3, 2] @ up >= MAX_TILT_COSINE * np.linalg.norm(up)]
+        found += sorted(pair, key=lambda start: start.curl)  # leaves bend down
     if not found:
         raise NoPhytomerError(
             "no stem with a leaf was found: expected a straight piece with round sections and a leaf beside it"
@@ -70,9 +71,7 @@ def start_poses(points: FloatArray, stem_radius: float, *, up: FloatArray | None
     return found
 
 
-def _sections(
-    points: FloatArray, center: FloatArray, axis: FloatArray, radius: float
-) -> tuple[FloatArray, ...]:
+def _sections(points: FloatArray, center: FloatArray, axis: FloatArray, radius: float) -> tuple[FloatArray, ...]:
     """Sections of the points around a line, each half a radius high: height, count, roundness, offset, spread."""
     along = (points - center) @ axis
     across = points - center - along[:, np.newaxis] * axis
@@ -139,12 +138,30 @@ def _lines(points: FloatArray, radius: float) -> list[tuple[FloatArray, FloatArr
     lines.sort(key=lambda line: -line[0])
     kept: list[tuple[FloatArray, FloatArray]] = []
     for score, center, axis in lines:
-        if score <= 0 or len(kept) == N_LINES or score < 0.3 * lines[0][0]:
+        if score <= 0 or len(kept) == N_LINES or score < LEAST_SHARE * lines[0][0]:
             break
         if all(_differ(center, axis, other, direction, radius) for other, direction in kept):
             # the sign of an eigenvector is arbitrary: take it from the points, so that it turns with them
             kept.append((center, axis if (points.mean(axis=0) - center) @ axis >= 0 else -axis))
     return kept
+
+
+def _height_at_axis(distance: FloatArray, height: FloatArray, n_bins: int = 8) -> float:
+    """Height at which a leaf's base, given by its points near the stem, would meet the stem's axis.
+
+    The median slope between medians of bins (Theil and Sen): what else sticks out near the stem does not decide.
+    """
+    edges = np.quantile(distance, np.linspace(0.0, 1.0, n_bins + 1))
+    bins = np.clip(np.searchsorted(edges, distance, side="right") - 1, 0, n_bins - 1)
+    present = np.unique(bins)
+    d = np.array([np.median(distance[bins == k]) for k in present])
+    h = np.array([np.median(height[bins == k]) for k in present])
+    i, j = np.triu_indices(len(d), k=1)
+    apart = d[j] > d[i]
+    if not apart.any():
+        return float(np.median(height))
+    slope = np.median((h[j] - h[i])[apart] / (d[j] - d[i])[apart])
+    return float(np.median(h - np.clip(slope, -MAX_SLOPE, MAX_SLOPE) * d))
 
 
 def _differ(c0: FloatArray, a0: FloatArray, c1: FloatArray, a1: FloatArray, radius: float) -> bool:
@@ -154,9 +171,7 @@ def _differ(c0: FloatArray, a0: FloatArray, c1: FloatArray, a1: FloatArray, radi
     return float(np.linalg.norm(gap)) > radius
 
 
-def _pose_on_line(
-    points: FloatArray, center: FloatArray, axis: FloatArray, radius: float
-) -> StartPose | None:
+def _pose_on_line(points: FloatArray, center: FloatArray, axis: FloatArray, radius: float) -> StartPose | None:
     """The pose that has the stem on this line: refined axis, ends of the stem, collar and leaf side."""
     _, count, roundness, offset, spread = _sections(points, center, axis, radius)
     stemlike = (roundness > LEAST_ROUNDNESS) & (offset < 0.5 * radius) & (count >= 5)
@@ -177,7 +192,8 @@ def _pose_on_line(
     if beside.sum() < 5:  # the leaf's base is hidden: take what is nearest to the stem
         order = np.argsort(distance[leaf], kind="stable")[: max(5, leaf.sum() // 10)]
         beside = np.flatnonzero(leaf)[order]
-    collar = float(np.clip(np.median(along[beside]), ends[0], ends[1]))
+    collar = float(np.clip(_height_at_axis(distance[beside], along[beside]), ends[0], ends[1]))
+    curl = float(np.polynomial.polynomial.polyfit(distance[leaf], along[leaf], 2)[2])
     side -= (side @ axis) * axis
     if np.linalg.norm(side) < 1e-9:
         return None
@@ -186,4 +202,4 @@ def _pose_on_line(
     pose[:3, :3] = np.stack([x, np.cross(axis, x), axis], axis=1)
     pose[:3, 3] = center + collar * axis
     score = float(_stem_score(points, center, axis, radius))
-    return StartPose(pose, float(ends[0]) - collar, float(ends[1]) - collar, stem_radius, score)
+    return StartPose(pose, float(ends[0]) - collar, float(ends[1]) - collar, stem_radius, curl, score)

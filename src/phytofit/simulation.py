@@ -1,9 +1,10 @@
 """Simulated phytomers: true organs to a cloud, with noise, removed spheres, outliers and a random pose."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from phytofit.errors import SettingError
 from phytofit.models import Organ, SurfaceSampler, move
@@ -30,7 +31,7 @@ class SimulatedPhytomer:
 def simulate(
     species: Species | None = None,
     *,
-    x: ArrayLike | None = None,
+    fixed: Mapping[str, float] | None = None,
     n_points: int = 5000,
     noise_cm: float = 0.5,
     n_spheres: int = 0,
@@ -39,10 +40,10 @@ def simulate(
     random_orientation: bool = True,
     seed: int = 0,
 ) -> SimulatedPhytomer:
-    """Draw a phytomer from the species' ranges, or build the given one, and scan it.
+    """Draw a phytomer from the species' ranges and scan it.
 
     Defaults are the paper's simulated protocol (section V); `n_spheres` of `sphere_diameter_cm` are its occlusions
-    (Fig. 7).  `x` (k,) are parameters in the order of the species' space.  `n_points` are drawn before spheres are
+    (Fig. 7).  `fixed` gives parameters by name that are not to be drawn.  `n_points` are drawn before spheres are
     removed; `outlier_share` of the points that are left is added.
     """
     species = load_species() if species is None else species
@@ -54,15 +55,16 @@ def simulate(
     if not 0 <= outlier_share < 1:
         raise SettingError(f"outliers: expected a share from 0 to below 1, got {outlier_share:g}")
     random = np.random.default_rng(seed)
-    if x is None:
-        x = random.uniform(species.ranges[:, 0], species.ranges[:, 1])
-    x = np.asarray(x, float)
     space = species.space
-    if x.shape != (len(space),) or not np.all((x >= space.lower) & (x <= space.upper)):
-        raise SettingError(
-            f"parameters: expected {len(space)} numbers within the species' bounds "
-            f"({', '.join(space.names)}), got {x.tolist()}"
-        )
+    x = random.uniform(species.ranges[:, 0], species.ranges[:, 1])
+    for name, value in (fixed or {}).items():
+        i = space.index(name)
+        if not space.lower[i] <= value <= space.upper[i]:
+            raise SettingError(
+                f"{name}: expected a number within the species' bounds [{space.lower[i]:g}, {space.upper[i]:g}], "
+                f"got {value:g}"
+            )
+        x[i] = value
     organs: tuple[Organ, ...] = tuple(o.row(0) for o in species.model.organs(x))
     points, organ = SurfaceSampler(n_points, int(random.integers(2**31))).draw(organs)
     labels = organ.astype(np.int64) + 1

@@ -79,9 +79,7 @@ def measure(
     ]
     for rank, leaf in enumerate(leaves, start=1):
         values = _leaf(stem, leaf, chord_cm)
-        traits += [
-            Trait(LEAF, rank, name, value, unit, None, None, method, flags) for name, value, unit in values
-        ]
+        traits += [Trait(LEAF, rank, name, value, unit, None, None, method, flags) for name, value, unit in values]
     return traits
 
 
@@ -125,9 +123,7 @@ def _leaves_stem_at(stem: Organ, leaf: Organ, node_at: FloatArray) -> float:
         a, b = stem.axis[j], stem.axis[j + 1]
         share = np.clip((points - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
         radius = stem.half_width[j] + share * (stem.half_width[j + 1] - stem.half_width[j])
-        depth = np.minimum(
-            depth, np.linalg.norm(points - a - share[:, np.newaxis] * (b - a), axis=1) - radius
-        )
+        depth = np.minimum(depth, np.linalg.norm(points - a - share[:, np.newaxis] * (b - a), axis=1) - radius)
     if depth[0] >= 0.0:
         return 0.0
     outside = np.flatnonzero(depth >= 0.0)

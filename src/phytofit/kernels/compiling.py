@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import config
 
 __all__ = ["kernel"]
 
@@ -26,9 +27,9 @@ def _writable(folder: Path) -> bool:
 
 
 # An installation may be read-only; compiled code then goes to a folder of this user's own.
-if not _writable(Path(__file__).parent / "__pycache__") and not numba.config.CACHE_DIR:
+if not _writable(Path(__file__).parent / "__pycache__") and not config.CACHE_DIR:  # type: ignore[attr-defined]
     user = os.getuid() if hasattr(os, "getuid") else os.environ.get("USERNAME", "user")
-    numba.config.CACHE_DIR = str(Path(tempfile.gettempdir()) / f"phytofit-numba-{user}")
+    config.CACHE_DIR = str(Path(tempfile.gettempdir()) / f"phytofit-numba-{user}")  # type: ignore[attr-defined]
 
 
 def kernel(function: F) -> F:
@@ -36,7 +37,7 @@ def kernel(function: F) -> F:
 
     Sums may be reassociated (they then use the machine's vector units), but NaN and infinity keep their meaning.
     """
-    compiled = numba.njit(
-        cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"}
-    )(function)
+    compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"})(
+        function
+    )
     return cast(F, compiled)

@@ -38,7 +38,7 @@ def _to_target2(points, target, bins, reached):
         w = min(max((z - o2) * inverse, zero), top2)
         a, b, c = np.int32(u), np.int32(v), np.int32(w)
         i0, i1, i2 = a // e, b // e, c // e
-        k = target.index[i0 * stride0 + i1 * stride1 + i2]
+        k = target.coarse[i0 * stride0 + i1 * stride1 + i2]
         if k < 0:
             k = target.fine[-1 - k, ((a - i0 * e) * e + (b - i1 * e)) * e + (c - i2 * e)]
         dx = target.points[k, 0] - x

@@ -150,7 +150,7 @@ def _match(source, r, t, target, sums, cell, part, qx, qy, qz):
             cell[i] = i0 * stride0 + i1 * stride1 + i2
             part[i] = ((a - i0 * d) * d + (b - i1 * d)) * d + (c - i2 * d)
         for i in range(m):
-            k = target.index[cell[i]]
+            k = target.coarse[cell[i]]
             if k < 0:
                 k = target.fine[-1 - k, part[i]]
             qx[i] = target.points[k, 0]
@@ -280,6 +280,7 @@ def icp(source, target, r_start, t_start, max_iterations, tolerance, memory):
             mse += x[3 + a] * (x[3 + a] - 2.0 * sums[a] / n)
         if kept > 1 and mse > last_mse * (1.0 + 1e-6):
             x[:] = last_g  # the mixed pose was worse: back to the plain step, with no memory
+            mse = last_mse
             kept = 0
             last_mse = np.inf
             _rotate_by(x, 1.0 / radius, base, r)
@@ -287,9 +288,7 @@ def icp(source, target, r_start, t_start, max_iterations, tolerance, memory):
         r_plain = best_rotation(cross)
         for i in range(3):
             for j in range(3):
-                relative[i, j] = (
-                    r_plain[i, 0] * base[j, 0] + r_plain[i, 1] * base[j, 1] + r_plain[i, 2] * base[j, 2]
-                )
+                relative[i, j] = r_plain[i, 0] * base[j, 0] + r_plain[i, 1] * base[j, 1] + r_plain[i, 2] * base[j, 2]
         _log_rotation(relative, g)
         step = 0.0
         for a in range(3):
@@ -302,7 +301,7 @@ def icp(source, target, r_start, t_start, max_iterations, tolerance, memory):
         last_mse = mse
         last_g[:] = g
         x[:] = g
-        if memory > 0 and not converged:
+        if memory > 0 and not converged and iterations < max_iterations:  # no mixed pose goes out unmatched
             if kept == memory + 1:
                 for k in range(memory):
                     g_history[k] = g_history[k + 1]

@@ -35,13 +35,13 @@ MAX_BINS = 32_768
 class NearestGrid(NamedTuple):
     """Index of (about) the nearest point for every cell of a box around a cloud.
 
-    ``index`` (nx * ny * nz,) int32 in C order: a point's index, or -1 - b for a cell that is divided into the indices
+    ``coarse`` (nx * ny * nz,) int32 in C order: a point's index, or -1 - b for a cell that is divided into the indices
     ``fine[b]``, (SUBDIVISION**3,) int32 in C order; ``dims`` (3,) int64 cells a side; ``origin`` (3,) the box's low
     corner; ``inverse_cell`` 1 / edge of a cell; ``points`` (m, 4) float32, the cloud, padded to one aligned load a
     point.  Positions outside the box take the answer of the nearest cell.
     """
 
-    index: NDArray[np.int32]
+    coarse: NDArray[np.int32]
     fine: NDArray[np.int32]
     dims: NDArray[np.int64]
     origin: FloatArray
@@ -143,7 +143,7 @@ def bin_points(x, y, z, least_edge):
     while True:
         for a in range(3):
             dims[a] = np.int64((high[a] - low[a]) / edge) + 1
-        if dims[0] * dims[1] * dims[2] <= MAX_BINS:
+        if np.float64(dims[0]) * dims[1] * dims[2] <= MAX_BINS:  # the product of integers may overflow
             break
         edge *= 1.1
     start = np.zeros(dims[0] * dims[1] * dims[2] + 1, np.int32)
@@ -285,9 +285,7 @@ def _divide(cells, bins, dims, origin, cell, subdivision, index, fine):
         index[cells[b]] = -1 - b
 
 
-def nearest_grid(
-    points: FloatArray, bins: Bins, cell: float | None = None, margin: float | None = None
-) -> NearestGrid:
+def nearest_grid(points: FloatArray, bins: Bins, cell: float | None = None, margin: float | None = None) -> NearestGrid:
     """Build the grid of nearest indices of a cloud.
 
     Parameters

@@ -51,9 +51,9 @@ class Organ:
         """Area (...) of the surface, cm²: one side of a leaf, the lateral surface of a stem."""
         width = self.half_width[..., 1:] + self.half_width[..., :-1]
         if self.kind == LEAF:
-            return np.sum(width * self.segment_lengths, axis=-1)
+            return np.asarray(np.sum(width * self.segment_lengths, axis=-1))
         slant = np.hypot(self.segment_lengths, np.diff(self.half_width, axis=-1))
-        return np.pi * np.sum(width * slant, axis=-1)
+        return np.asarray(np.pi * np.sum(width * slant, axis=-1))
 
 
 def frames_along(axis: FloatArray, lateral: FloatArray) -> FloatArray:
@@ -97,9 +97,7 @@ class SurfaceSampler:
 
     def draw(self, organs: Sequence[Organ]) -> tuple[FloatArray, NDArray[np.int8]]:
         """Points (n_points, 3), cm, on one plant, and the number (n_points,) of the organ that each lies on."""
-        batched = [
-            Organ(o.kind, o.axis[np.newaxis], o.frame[np.newaxis], o.half_width[np.newaxis]) for o in organs
-        ]
+        batched = [Organ(o.kind, o.axis[np.newaxis], o.frame[np.newaxis], o.half_width[np.newaxis]) for o in organs]
         points, label = self.population(batched).draw(0)
         return points.T.astype(float), label
 
@@ -110,9 +108,7 @@ class PopulationSurfaces:
     def __init__(self, sampler: SurfaceSampler, organs: Sequence[Organ]) -> None:
         self._sampler = sampler
         self._axis = np.concatenate([o.axis for o in organs], axis=1)
-        frames = [
-            np.concatenate([o.frame, o.frame[:, -1:]], axis=1) for o in organs
-        ]  # one a node, for the kernel
+        frames = [np.concatenate([o.frame, o.frame[:, -1:]], axis=1) for o in organs]  # one a node, for the kernel
         self._frame = np.ascontiguousarray(np.concatenate(frames, axis=1))
         self._half_width = np.concatenate([o.half_width for o in organs], axis=1)
         self._first = np.cumsum([0, *(o.axis.shape[1] for o in organs)])

@@ -90,3 +90,17 @@ class Phytomer:
             0.5 * leaf_width[:, np.newaxis] * self.width_profile(),
         )
         return stem, leaf
+
+    @staticmethod
+    def upside_down(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The other parameters x (7,) of the same organs, seen upside down: ``turn @ x + offset``.
+
+        Returns turn (7, 7), offset (7,) and the pose (4, 4) from the other plant's frame to this one's.  Without what
+        is known of leaves (they leave the stem upwards and bend down) no cloud can tell the two apart.
+        """
+        turn = np.eye(7)[[0, 6, 2, 3, 4, 5, 1]]  # what was below the leaf is above it
+        turn[2, 2] = turn[5, 5] = -1.0
+        offset = np.array([0.0, 0.0, 180.0, 0.0, 0.0, 0.0, 0.0])
+        pose = np.diag([1.0, -1.0, -1.0, 1.0])
+        pose[2, 3] = x[1] + x[6]
+        return turn, offset, pose

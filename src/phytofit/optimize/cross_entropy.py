@@ -119,9 +119,7 @@ class CrossEntropy:
             )
         order = np.argsort(errors, kind="stable")[: self.n_elite]  # NaN sorts last
         if not np.isfinite(errors[order[-1]]):
-            raise SettingError(
-                f"tell: expected at least {self.n_elite} finite errors, got {np.isfinite(errors).sum()}"
-            )
+            raise SettingError(f"tell: expected at least {self.n_elite} finite errors, got {np.isfinite(errors).sum()}")
         elite = xs[order]
         self.mean = elite.mean(axis=0)
         deviation = elite - self.mean

@@ -1,7 +1,7 @@
 """Species as data: a TOML file gives the model, its constants and the prior of its parameters."""
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -28,6 +28,12 @@ class Species:
     model: Phytomer
     space: ParameterSpace
     ranges: NDArray[np.float64]
+
+    def without(self, parameter: str) -> "Species":
+        """The species with its last parameter left out, if it is the one called `parameter`."""
+        if self.space.names[-1] != parameter:
+            return self
+        return replace(self, space=ParameterSpace(self.space.parameters[:-1]), ranges=self.ranges[:-1])
 
 
 class _Constants(BaseModel):

@@ -1,0 +1,83 @@
+"""phytofit: plant traits from 3D point clouds, by fitting parametric plant models.
+
+>>> import phytofit
+>>> result = phytofit.fit(phytofit.read_cloud("leaf.ply", units="cm"))
+>>> result.parameters["leaf_length"], [trait.value for trait in result.traits]
+"""
+
+from phytofit.cloud import PointCloud, from_points, remove_outliers, thin
+from phytofit.distances import DISTANCES, Reference
+from phytofit.errors import (
+    CloudError,
+    InputError,
+    NoPhytomerError,
+    OutputError,
+    PhytofitError,
+    SettingError,
+    SpeciesError,
+    Status,
+    UnitError,
+)
+from phytofit.fitting import Fit, fit, minimise
+from phytofit.formats import read_cloud, write_cloud
+from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move
+from phytofit.objectives import PaperObjective, Registration
+from phytofit.optimize import CrossEntropy, Generation
+from phytofit.parameters import Parameter, ParameterSpace
+from phytofit.plots import plot_convergence, plot_fit
+from phytofit.pose import StartPose, start_poses
+from phytofit.recipe import recipe
+from phytofit.results import save_fit, trait_table
+from phytofit.simulation import SimulatedPhytomer, add_noise, add_outliers, occlude, simulate
+from phytofit.species import Species, load_species
+from phytofit.traits import Trait, measure
+
+__all__ = [
+    "DISTANCES",
+    "CloudError",
+    "CrossEntropy",
+    "Fit",
+    "Generation",
+    "InputError",
+    "NoPhytomerError",
+    "Organ",
+    "OutputError",
+    "PaperObjective",
+    "Parameter",
+    "ParameterSpace",
+    "PhytofitError",
+    "Phytomer",
+    "PointCloud",
+    "Reference",
+    "Registration",
+    "SettingError",
+    "SimulatedPhytomer",
+    "Species",
+    "SpeciesError",
+    "StartPose",
+    "Status",
+    "SurfaceSampler",
+    "Trait",
+    "UnitError",
+    "add_noise",
+    "add_outliers",
+    "fit",
+    "from_points",
+    "load_species",
+    "measure",
+    "mesh",
+    "minimise",
+    "move",
+    "occlude",
+    "plot_convergence",
+    "plot_fit",
+    "read_cloud",
+    "recipe",
+    "remove_outliers",
+    "save_fit",
+    "simulate",
+    "start_poses",
+    "thin",
+    "trait_table",
+    "write_cloud",
+]

@@ -1,0 +1,47 @@
+"""The recipe of a run: every setting, read off the one place where it stands, its function's keyword default."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from phytofit.cloud import remove_outliers, thin
+from phytofit.distances import chamfer, hausdorff, labelled_hausdorff, quantile_hausdorff
+from phytofit.fitting import Fit, fit
+from phytofit.objectives import PaperObjective
+
+__all__ = ["defaults", "recipe", "recipe_of"]
+
+STEPS: dict[str, Callable[..., Any]] = {
+    "fit": fit,
+    "remove_outliers": remove_outliers,
+    "thin": thin,
+    "objective": PaperObjective,
+    "distance_hausdorff": hausdorff,
+    "distance_quantile": quantile_hausdorff,
+    "distance_chamfer": chamfer,
+    "distance_labels": labelled_hausdorff,
+}
+NOT_SETTINGS = {"progress", "executor", "threads", "units"}  # they change how a result is made or told, not the result
+FROM_FIT = {"n_points", "seed", "distance"}  # fit hands these on
+
+
+def defaults(function: Callable[..., Any]) -> dict[str, Any]:
+    """The keyword defaults of a function."""
+    parameters = inspect.signature(function).parameters.values()
+    return {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
+
+
+def recipe() -> dict[str, dict[str, Any]]:
+    """All settings with their defaults: ``{step: {setting: value}}``."""
+    found = {}
+    for step, function in STEPS.items():
+        handed_on = set() if function is fit else FROM_FIT
+        found[step] = {k: v for k, v in defaults(function).items() if k not in NOT_SETTINGS | handed_on}
+    return {step: settings for step, settings in found.items() if settings}
+
+
+def recipe_of(result: Fit) -> dict[str, dict[str, Any]]:
+    """The recipe that made this result."""
+    made = recipe()
+    made["fit"] |= {"species": result.species.name, "seed": result.seed, **result.settings}
+    return made

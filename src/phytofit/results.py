@@ -1,0 +1,166 @@
+"""What a result looks like on disk: one folder a cloud, one table over all, nothing half-written."""
+
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from phytofit.cloud import PointCloud
+from phytofit.errors import OutputError
+from phytofit.fitting import Fit
+from phytofit.models import mesh
+from phytofit.plots import plot_convergence, plot_fit
+from phytofit.recipe import recipe_of
+from phytofit.traits import Trait
+
+__all__ = ["COLUMNS", "prepare_folder", "result_names", "save_fit", "trait_table", "write_text"]
+
+COLUMNS = ["cloud", "organ", "rank", "trait", "value", "unit", "low", "high", "method", "flags"]
+DIGITS = 6  # significant, in tables; fit.json has all
+
+
+def trait_table(name: str, traits: Iterable[Trait]) -> pd.DataFrame:
+    """Tidy table of traits, one row an organ and trait, with the columns `COLUMNS`; `name` is the cloud's."""
+    rows = [
+        (name, t.organ, t.rank, t.name, t.value, t.unit, t.low, t.high, t.method, "; ".join(t.flags)) for t in traits
+    ]
+    return pd.DataFrame(rows, columns=COLUMNS).astype({"low": float, "high": float})
+
+
+def result_names(paths: Sequence[Path]) -> list[str]:
+    """A name for each cloud: its file's stem; where two are alike, with the parent folder's name in front, and if
+    that is not enough with the file's ending behind, then with a number."""
+    for make in (
+        lambda p: p.stem,
+        lambda p: f"{p.resolve().parent.name}_{p.stem}",
+        lambda p: f"{p.resolve().parent.name}_{p.name.replace('.', '_')}",
+    ):
+        names = [make(path) for path in paths]
+        if len(set(names)) == len(names):
+            return names
+        stems = [path.stem for path in paths]
+        mixed = [name if stems.count(path.stem) > 1 else path.stem for name, path in zip(names, paths, strict=True)]
+        if len(set(mixed)) == len(mixed):
+            return mixed
+    return [f"{name}_{number}" for number, name in enumerate(names, start=1)]
+
+
+def prepare_folder(folder: Path) -> Path:
+    """Make sure that results can be written to the folder; OutputError if not."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: results can't be written there ({error.strerror}); name another folder with --out"
+        ) from None
+    return folder
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a whole file or nothing."""
+    part = path.with_name(f".{path.name}.part-{os.getpid()}")
+    try:
+        part.write_text(text, encoding="utf-8", newline="")
+        part.replace(path)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise OutputError(f"{path}: can't be written ({error.strerror})") from None
+
+
+def save_fit(result: Fit, cloud: PointCloud, folder: Path, name: str | None = None) -> Path:
+    """Write ``folder/name/``: fit.json, traits.csv, model.ply, fit.png and convergence.png; all of them or none.
+
+    A folder of that name from an earlier run is replaced.  model.ply is in the input's unit and frame.
+    """
+    name = name or cloud.name
+    target = prepare_folder(folder) / name
+    part = Path(tempfile.mkdtemp(prefix=f".{name}.part-", dir=folder))
+    try:
+        part.chmod(0o755)
+        (part / "fit.json").write_text(json.dumps(_as_json(result, cloud, name), indent=1) + "\n", encoding="utf-8")
+        (part / "traits.csv").write_text(table_text(trait_table(name, result.traits)), encoding="utf-8", newline="")
+        model = mesh(result.organs)
+        model.vertices = cloud.to_input_frame(np.asarray(model.vertices))
+        model.export(part / "model.ply")
+        plot_fit(result, title=name).savefig(part / "fit.png", dpi=150, metadata={"Software": None})
+        plot_convergence(result).savefig(part / "convergence.png", dpi=150, metadata={"Software": None})
+        if target.exists():
+            shutil.rmtree(target)
+        part.rename(target)
+    except OSError as error:
+        raise OutputError(f"{target}: the result can't be written ({error.strerror})") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+    return target
+
+
+def table_text(table: pd.DataFrame) -> str:
+    """The table as CSV, `DIGITS` significant digits, empty where there is no value."""
+    text: str = table.to_csv(index=False, float_format=f"%.{DIGITS}g", lineterminator="\n")
+    return text
+
+
+def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
+    """What fit.json holds; no times, so that the same run gives the same bytes."""
+    space = result.species.space
+    traits = trait_table(name, result.traits).drop(columns=["cloud", "flags"]).replace({np.nan: None})
+    return {
+        "phytofit": version("phytofit"),
+        "cloud": name,
+        "input": {
+            "file": None if cloud.source is None else cloud.source.name,
+            "sha256": _hash(cloud),
+            "unit": cloud.unit,
+        },
+        "species": result.species.name,
+        "model": type(result.species.model).__name__,
+        "method": result.method,
+        "status": result.status.value,
+        "flags": list(result.flags),
+        "notes": list(result.notes),
+        "parameters": {
+            p: {"value": value, "low": None, "high": None, "unit": _unit(unit, result)}
+            for (p, value), unit in zip(result.parameters.items(), space.units, strict=True)
+        },
+        "traits": traits.to_dict(orient="records"),
+        "error": result.error,
+        "pose": result.pose.tolist(),
+        "registration": {
+            "rmse": result.registration.rmse,
+            "iterations": result.registration.iterations,
+            "converged": result.registration.converged,
+        },
+        "history": [
+            {
+                "generation": g.index,
+                "mean": g.mean.tolist(),
+                "cov": g.cov.tolist(),
+                "threshold": g.threshold,
+                "best_x": g.best_x.tolist(),
+                "best_error": g.best_error,
+            }
+            for g in result.history
+        ],
+        "seed": result.seed,
+        "settings": recipe_of(result),
+    }
+
+
+def _unit(unit: str, result: Fit) -> str:
+    return "relative" if result.relative and unit == "cm" else unit
+
+
+def _hash(cloud: PointCloud) -> str:
+    """SHA-256 of the file, or of the points where there is none."""
+    data = np.ascontiguousarray(cloud.points).tobytes() if cloud.source is None else cloud.source.read_bytes()
+    return hashlib.sha256(data).hexdigest()
