@@ -37,7 +37,7 @@ def both_ways(a, b):
 def leaf_like(seed, n, noise=0.0):
     random = np.random.default_rng(seed)
     u, v = random.uniform(-1, 1, (2, n))
-    points = np.stack([15 * u, 3 * v, 4 * u**2], axis=1) + [20.0, -5.0, 8.0] + random.normal(0, noise, (n, 3))
+    points = np.stack([15 * u + 20.0, 3 * v - 5.0, 4 * u**2 + 8.0], axis=1) + random.normal(0, noise, (n, 3))
     return points.astype(np.float32).astype(float)
 
 
@@ -52,7 +52,7 @@ SPREAD = leaf_like(0, 40)
 @example(np.repeat(ONE, 5, axis=0), SPREAD)
 @example(SPREAD, np.repeat(ONE, 5, axis=0))
 @example(SPREAD, SPREAD)
-@example(SPREAD, SPREAD[::-1] + [500.0, -300.0, 1000.0])
+@example(SPREAD, SPREAD[::-1] + np.array([500.0, -300.0, 1000.0]))
 @example(SPREAD * 1e-3, SPREAD)
 def test_both_directions_agree_with_scipy(source, target):
     source = source.astype(np.float32).astype(float)

@@ -47,7 +47,7 @@ def leafy(seed, n):
     """A curved surface with a spike: far from a cube, as plants are."""
     random = np.random.default_rng(seed)
     u, v = random.uniform(-1, 1, (2, n))
-    surface = np.stack([12 * u, 2 * v, 3 * u**2 + v], axis=1) + [5.0, -40.0, 12.0]
+    surface = np.stack([12 * u + 5.0, 2 * v - 40.0, 3 * u**2 + v + 12.0], axis=1)
     surface[: n // 5] = np.stack([0 * u, 0 * u, 10 * u], axis=1)[: n // 5]
     return surface.astype(np.float32).astype(float)
 

@@ -47,8 +47,7 @@ class Reference:
     @classmethod
     def of(cls, points: FloatArray, organ: OrganArray | None = None) -> "Reference":
         """From points (m, 3), m >= 1."""
-        bins = make_bins(points)
-        return cls(points, nearest_grid(points, bins), bins, organ)
+        return cls(points, nearest_grid(points), make_bins(points), organ)
 
     @property
     def columns(self) -> Float32Array:

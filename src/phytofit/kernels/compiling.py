@@ -1,8 +1,9 @@
 """How kernels are compiled: once for all kernels, so that they agree on rounding and on caching."""
 
+import hashlib
 import os
+import shutil
 import tempfile
-import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -13,23 +14,34 @@ from numba.core import config
 __all__ = ["kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
+KEPT_VERSIONS = 4  # of compiled code, one a version of the sources
 
 
-def _writable(folder: Path) -> bool:
-    probe = folder / f".phytofit-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-    try:
-        folder.mkdir(exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError:
-        return False
-    return True
+def _cache_folder() -> str | None:
+    """A writable folder for compiled code that belongs to exactly these sources; None where there is none.
+
+    Numba asks only whether a kernel's own file has changed, but kernels are compiled into each other, and an
+    installation may be read-only: so the folder is the user's, and named after all the sources.
+    """
+    digest = hashlib.sha256(numba.__version__.encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(source.read_bytes())
+    name = f"kernels-{digest.hexdigest()[:16]}"
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+    for root in (home / "phytofit", Path(tempfile.gettempdir()) / f"phytofit-{os.environ.get('USER', 'user')}"):
+        try:
+            (root / name).mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=root / name):
+                pass
+        except OSError:
+            continue
+        for old in sorted(root.glob("kernels-*"), key=lambda folder: folder.stat().st_mtime)[:-KEPT_VERSIONS]:
+            shutil.rmtree(old, ignore_errors=True)
+        return str(root / name)
+    return None
 
 
-# An installation may be read-only; compiled code then goes to a folder of this user's own.
-if not _writable(Path(__file__).parent / "__pycache__") and not config.CACHE_DIR:  # type: ignore[attr-defined]
-    user = os.getuid() if hasattr(os, "getuid") else os.environ.get("USERNAME", "user")
-    config.CACHE_DIR = str(Path(tempfile.gettempdir()) / f"phytofit-numba-{user}")  # type: ignore[attr-defined]
+CACHE_FOLDER = _cache_folder()
 
 
 def kernel(function: F) -> F:
@@ -37,7 +49,15 @@ def kernel(function: F) -> F:
 
     Sums may be reassociated (they then use the machine's vector units), but NaN and infinity keep their meaning.
     """
-    compiled = numba.njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"})(
-        function
-    )
+    others = config.CACHE_DIR  # type: ignore[attr-defined]
+    config.CACHE_DIR = CACHE_FOLDER or others  # type: ignore[attr-defined]
+    try:
+        compiled = numba.njit(
+            cache=CACHE_FOLDER is not None,
+            nogil=True,
+            error_model="numpy",
+            fastmath={"reassoc", "contract", "nsz", "arcp"},
+        )(function)
+    finally:
+        config.CACHE_DIR = others  # type: ignore[attr-defined]
     return cast(F, compiled)

@@ -7,7 +7,7 @@ needs no exact search.  An upper bound from the grid of nearest indices, or any 
 import numpy as np
 
 from phytofit.kernels.compiling import kernel
-from phytofit.kernels.nearest import SUBDIVISION, Bins, bin_points, exact_nearest
+from phytofit.kernels.nearest import Bins, bin_points, exact_nearest
 
 __all__ = ["directed_hausdorff", "hausdorff", "hausdorff_within"]
 
@@ -22,12 +22,11 @@ def _to_target2(points, target, bins, reached):
     bound2 = np.empty(n, np.float32)
     near = np.empty(n, np.int32)
     o0, o1, o2 = np.float32(target.origin[0]), np.float32(target.origin[1]), np.float32(target.origin[2])
-    inverse = np.float32(target.inverse_cell * SUBDIVISION)
+    inverse = np.float32(target.inverse_cell)
     zero = np.float32(0.0)
-    top0 = np.float32(target.dims[0] * SUBDIVISION - 1)
-    top1 = np.float32(target.dims[1] * SUBDIVISION - 1)
-    top2 = np.float32(target.dims[2] * SUBDIVISION - 1)
-    e = np.int32(SUBDIVISION)
+    top0 = np.float32(target.dims[0] - 1)
+    top1 = np.float32(target.dims[1] - 1)
+    top2 = np.float32(target.dims[2] - 1)
     stride0 = np.int32(target.dims[1] * target.dims[2])
     stride1 = np.int32(target.dims[2])
     top = 0
@@ -36,11 +35,7 @@ def _to_target2(points, target, bins, reached):
         u = min(max((x - o0) * inverse, zero), top0)
         v = min(max((y - o1) * inverse, zero), top1)
         w = min(max((z - o2) * inverse, zero), top2)
-        a, b, c = np.int32(u), np.int32(v), np.int32(w)
-        i0, i1, i2 = a // e, b // e, c // e
-        k = target.coarse[i0 * stride0 + i1 * stride1 + i2]
-        if k < 0:
-            k = target.fine[-1 - k, ((a - i0 * e) * e + (b - i1 * e)) * e + (c - i2 * e)]
+        k = target.nearest[np.int32(u) * stride0 + np.int32(v) * stride1 + np.int32(w)]
         dx = target.points[k, 0] - x
         dy = target.points[k, 1] - y
         dz = target.points[k, 2] - z

@@ -13,7 +13,6 @@ centroid and the centroid's place in the target's frame.
 import numpy as np
 
 from phytofit.kernels.compiling import kernel
-from phytofit.kernels.nearest import SUBDIVISION
 
 __all__ = ["best_rotation", "icp", "transform"]
 
@@ -110,7 +109,7 @@ def _rotate_by(vector, scale, base, out):
 
 
 @kernel
-def _match(source, r, t, target, sums, cell, part, qx, qy, qz):
+def _match(source, r, t, target, sums, cell, qx, qy, qz):
     """One round of matching, in three passes over a block so that the first and last use vector units.
 
     sums (13,) becomes sum q (3), sum p q^T (9, row-major), sum |q|^2; p are source points about their centroid.
@@ -122,12 +121,11 @@ def _match(source, r, t, target, sums, cell, part, qx, qy, qz):
     t0 = np.float32(t[0] - target.origin[0])
     t1 = np.float32(t[1] - target.origin[1])
     t2 = np.float32(t[2] - target.origin[2])
-    inverse = np.float32(target.inverse_cell * SUBDIVISION)
+    inverse = np.float32(target.inverse_cell)
     zero = np.float32(0.0)
-    top0 = np.float32(target.dims[0] * SUBDIVISION - 1)
-    top1 = np.float32(target.dims[1] * SUBDIVISION - 1)
-    top2 = np.float32(target.dims[2] * SUBDIVISION - 1)
-    d = np.int32(SUBDIVISION)
+    top0 = np.float32(target.dims[0] - 1)
+    top1 = np.float32(target.dims[1] - 1)
+    top2 = np.float32(target.dims[2] - 1)
     stride0 = np.int32(target.dims[1] * target.dims[2])
     stride1 = np.int32(target.dims[2])
     for s in range(13):
@@ -145,14 +143,9 @@ def _match(source, r, t, target, sums, cell, part, qx, qy, qz):
             u = min(max(u, zero), top0)
             v = min(max(v, zero), top1)
             w = min(max(w, zero), top2)
-            a, b, c = np.int32(u), np.int32(v), np.int32(w)
-            i0, i1, i2 = a // d, b // d, c // d
-            cell[i] = i0 * stride0 + i1 * stride1 + i2
-            part[i] = ((a - i0 * d) * d + (b - i1 * d)) * d + (c - i2 * d)
+            cell[i] = np.int32(u) * stride0 + np.int32(v) * stride1 + np.int32(w)
         for i in range(m):
-            k = target.coarse[cell[i]]
-            if k < 0:
-                k = target.fine[-1 - k, part[i]]
+            k = target.nearest[cell[i]]
             qx[i] = target.points[k, 0]
             qy[i] = target.points[k, 1]
             qz[i] = target.points[k, 2]
@@ -246,7 +239,7 @@ def icp(source, target, r_start, t_start, max_iterations, tolerance, memory):
             square += np.float64(source[a, i]) * np.float64(source[a, i])
     radius = max(np.sqrt(square / n), 1e-9)
     sums = np.empty(13)
-    cell, part = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
+    cell = np.empty(BLOCK, np.int32)
     qx, qy, qz = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
     base = r_start.copy()
     r = r_start.copy()
@@ -269,7 +262,7 @@ def icp(source, target, r_start, t_start, max_iterations, tolerance, memory):
     iterations = 0
     while iterations < max_iterations and not converged:
         iterations += 1
-        _match(source, r, x[3:], target, sums, cell, part, qx, qy, qz)
+        _match(source, r, x[3:], target, sums, cell, qx, qy, qz)
         fit = 0.0
         for i in range(3):
             for j in range(3):

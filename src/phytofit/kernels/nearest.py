@@ -2,9 +2,8 @@
 
 Two structures, each built once a fit:
 
-- a *grid of nearest indices* answers "which point is nearest, about" with one or two memory accesses; the answer is
-  the point nearest to the cell's centre, so its distance is an upper bound of the true one.  Cells near the cloud
-  are divided again, `SUBDIVISION` times a side, so that the answer errs least where ICP comes to rest;
+- a *grid of nearest indices* answers "which point is nearest, about" with one memory access; the answer is the
+  point nearest to the cell's centre, so its distance is an upper bound of the true one;
 - *bins* (points sorted by cubic cell) answer exactly, searching outwards shell by shell.
 """
 
@@ -26,23 +25,19 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-MAX_CELLS = 1_000_000
-SUBDIVISION = 4
-NEAR = 2.5  # in cells: those whose centre is nearer to the cloud than this are divided
+MAX_CELLS = 2_000_000
 MAX_BINS = 32_768
 
 
 class NearestGrid(NamedTuple):
     """Index of (about) the nearest point for every cell of a box around a cloud.
 
-    ``coarse`` (nx * ny * nz,) int32 in C order: a point's index, or -1 - b for a cell that is divided into the indices
-    ``fine[b]``, (SUBDIVISION**3,) int32 in C order; ``dims`` (3,) int64 cells a side; ``origin`` (3,) the box's low
-    corner; ``inverse_cell`` 1 / edge of a cell; ``points`` (m, 4) float32, the cloud, padded to one aligned load a
-    point.  Positions outside the box take the answer of the nearest cell.
+    ``nearest`` (nx * ny * nz,) int32 in C order; ``dims`` (3,) int64 cells a side; ``origin`` (3,) the box's low corner;
+    ``inverse_cell`` 1 / edge of a cell; ``points`` (m, 4) float32, the cloud, padded to one aligned load a point.
+    Positions outside the box take the answer of the nearest cell.
     """
 
-    coarse: NDArray[np.int32]
-    fine: NDArray[np.int32]
+    nearest: NDArray[np.int32]
     dims: NDArray[np.int64]
     origin: FloatArray
     inverse_cell: float
@@ -127,6 +122,31 @@ def _fill_nearest(points, dims, origin, cell, index):
                             k_best = k
                     best[c] = d_best
                     index[c] = k_best
+
+
+def nearest_grid(points: FloatArray, cell: float | None = None, margin: float | None = None) -> NearestGrid:
+    """Build the grid of nearest indices of a cloud.
+
+    Parameters
+    ----------
+    points : (m, 3), m >= 1
+    cell : edge of a cell; by default half the typical spacing of the points, or what keeps to `MAX_CELLS`.
+    margin : how far the box reaches beyond the points; by default a tenth of the box's diagonal.
+    """
+    low, high = points.min(axis=0), points.max(axis=0)
+    diagonal = float(np.linalg.norm(high - low))
+    margin = max(0.1 * diagonal, 1e-6) if margin is None else margin
+    size = high - low + 2 * margin
+    if cell is None:
+        cell = 0.5 * diagonal / np.sqrt(len(points))
+    cell = max(float(cell), float(np.prod(size) / MAX_CELLS) ** (1 / 3))
+    dims = np.maximum(np.ceil(size / cell).astype(np.int64), 1)
+    padded = np.zeros((len(points), 4), np.float32)
+    padded[:, :3] = points
+    index = np.empty(int(np.prod(dims)), np.int32)
+    origin = low - margin
+    _fill_nearest(padded, dims, origin, cell, index)
+    return NearestGrid(index, dims, origin, 1.0 / cell, padded)
 
 
 @kernel
@@ -247,68 +267,3 @@ def nearest_distances(bins, x, y, z):
         distance[i] = np.sqrt(d)
         index[i] = bins.order[at]
     return distance, index
-
-
-@kernel
-def _near_cells(points, dims, origin, cell, reach, index):
-    """Cells (c,) int64 whose centre has its nearest point within `reach`."""
-    found = np.empty(index.shape[0], np.int64)
-    n = 0
-    for c in range(index.shape[0]):
-        i, rest = divmod(c, dims[1] * dims[2])
-        j, m = divmod(rest, dims[2])
-        dx = origin[0] + (i + 0.5) * cell - points[index[c], 0]
-        dy = origin[1] + (j + 0.5) * cell - points[index[c], 1]
-        dz = origin[2] + (m + 0.5) * cell - points[index[c], 2]
-        if dx * dx + dy * dy + dz * dz <= reach * reach:
-            found[n] = c
-            n += 1
-    return found[:n].copy()
-
-
-@kernel
-def _divide(cells, bins, dims, origin, cell, subdivision, index, fine):
-    """Fill fine[b] with the exact nearest index of each part's centre, for b-th of `cells`; index becomes -1 - b."""
-    part = cell / subdivision
-    for b in range(cells.shape[0]):
-        i, rest = divmod(cells[b], dims[1] * dims[2])
-        j, m = divmod(rest, dims[2])
-        within2 = np.inf
-        for p in range(subdivision):
-            for q in range(subdivision):
-                for r in range(subdivision):
-                    x = origin[0] + i * cell + (p + 0.5) * part
-                    y = origin[1] + j * cell + (q + 0.5) * part
-                    z = origin[2] + m * cell + (r + 0.5) * part
-                    _, at = exact_nearest(bins, x, y, z, within2, 0.0)
-                    fine[b, (p * subdivision + q) * subdivision + r] = bins.order[at]
-        index[cells[b]] = -1 - b
-
-
-def nearest_grid(points: FloatArray, bins: Bins, cell: float | None = None, margin: float | None = None) -> NearestGrid:
-    """Build the grid of nearest indices of a cloud.
-
-    Parameters
-    ----------
-    points : (m, 3), m >= 1
-    bins : of the same points
-    cell : edge of a cell; by default half the typical spacing of the points, or what keeps to `MAX_CELLS`.
-    margin : how far the box reaches beyond the points; by default a tenth of the box's diagonal.
-    """
-    low, high = points.min(axis=0), points.max(axis=0)
-    diagonal = float(np.linalg.norm(high - low))
-    margin = max(0.1 * diagonal, 1e-6) if margin is None else margin
-    size = high - low + 2 * margin
-    if cell is None:
-        cell = 0.5 * diagonal / np.sqrt(len(points))
-    cell = max(float(cell), float(np.prod(size) / MAX_CELLS) ** (1 / 3))
-    dims = np.maximum(np.ceil(size / cell).astype(np.int64), 1)
-    padded = np.zeros((len(points), 4), np.float32)
-    padded[:, :3] = points
-    index = np.empty(int(np.prod(dims)), np.int32)
-    origin = low - margin
-    _fill_nearest(padded, dims, origin, cell, index)
-    cells = _near_cells(padded, dims, origin, cell, NEAR * cell, index)
-    fine = np.empty((len(cells), SUBDIVISION**3), np.int32)
-    _divide(cells, bins, dims, origin, cell, SUBDIVISION, index, fine)
-    return NearestGrid(index, fine, dims, origin, 1.0 / cell, padded)
