@@ -22,8 +22,7 @@ def clouds():
 
 
 def searchable(target):
-    bins = make_bins(target)
-    return nearest_grid(target, bins), bins
+    return nearest_grid(target), make_bins(target)
 
 
 def columns(points):

@@ -12,14 +12,15 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from phytofit.kernels.icp import BLOCK, MAX_MEMORY, best_rotation, icp, transform
-from phytofit.kernels.nearest import make_bins, nearest_grid
+from phytofit.kernels.nearest import nearest_grid
 
 PROPER = 1e-9  # how far R R^T may be from 1, and det R: float64
 TOLERANCE = 1e-5  # cm; a round that moves the pose by less ends the loop
 SAME_POSE = 1e-3  # cm, RMS over the source; float32 matches on coordinates of up to 30 cm, and the loop's tolerance
 CANCELLATION = 3e-6  # of the largest coordinate squared: the mean square is a difference of such sums in float32
-APART = 0.12  # cm, about three parts of a divided cell of the grids below
-LOOK_UP = 5e-3  # cm²; a part of a divided cell of the grids below has a diagonal of 0.065 cm
+CELL = 0.06  # cm, of the grids below unless stated
+APART = 2 * CELL  # cm; points as far apart have a cell to themselves
+LOOK_UP = 3 * CELL**2  # cm²; a match may be a cell's diagonal further away than the nearest
 WORSE_BY_MIXING = 0.05  # share; a mixed path may come to rest at another of the many fixed points on a noisy surface
 
 
@@ -49,7 +50,7 @@ def surface(random, n):
 def copies(seed, degrees, shift=0.3, n=240):
     """The source is a part of the target: the true pose has no error.
 
-    Points are far enough apart that each has parts of the grid's cells to itself, so that the pose is at rest there.
+    Each point has its cell of the grid to itself, so that the true pose is at rest.
     """
     random = np.random.default_rng(seed)
     target = surface(random, n)
@@ -71,9 +72,9 @@ def noisy(seed, degrees, shift=0.3, n=240, noise=0.05):
     )
 
 
-def look_up(problem, cell=0.15):
+def look_up(problem, cell=CELL):
     """The target's grid, and its cells' diagonal: how much further than the nearest a match may be."""
-    grid = nearest_grid(problem.target, make_bins(problem.target), cell=cell)
+    grid = nearest_grid(problem.target, cell=cell)
     return grid, np.sqrt(3.0) / grid.inverse_cell
 
 
@@ -82,7 +83,7 @@ def register(problem, grid, memory=0, max_iterations=200):
     return icp(source, grid, problem.r, problem.t, max_iterations, TOLERANCE, memory)
 
 
-def solve(problem, *, memory=0, max_iterations=200, cell=0.15):
+def solve(problem, *, memory=0, max_iterations=200, cell=CELL):
     """The kernel's answer, and how much further than the nearest a match may be."""
     grid, diagonal = look_up(problem, cell)
     return register(problem, grid, memory, max_iterations), diagonal
@@ -180,7 +181,7 @@ def test_plain_icp_is_besl_mckay_where_no_match_is_in_doubt(seed, n):
         source.mean(axis=0) + random.uniform(-0.05, 0.05, 3),
     )
     for rounds in (1, 2, 200):
-        (r, t, _, _, _), _ = solve(problem, max_iterations=rounds, cell=0.3)
+        (r, t, _, _, _), _ = solve(problem, max_iterations=rounds, cell=0.1)
         assert apart(problem, (r, t), besl_mckay(problem, rounds)) < SAME_POSE
 
 

@@ -32,15 +32,9 @@ def columns(points):
 
 
 def lookup(grid, queries):
-    """What the grid answers for queries (n, 3), and which answers come from a divided cell."""
-    d = nearest.SUBDIVISION
-    part = ((queries - grid.origin) * grid.inverse_cell * d).astype(int)
-    part = np.clip(part, 0, grid.dims * d - 1)
-    cell, within = part // d, part % d
-    k = grid.coarse[np.ravel_multi_index(cell.T, grid.dims)].astype(int)
-    divided = k < 0
-    k[divided] = grid.fine[-1 - k[divided], np.ravel_multi_index(within[divided].T, (d, d, d))]
-    return k, divided
+    """What the grid answers for queries (n, 3)."""
+    cell = np.clip(((queries - grid.origin) * grid.inverse_cell).astype(int), 0, grid.dims - 1)
+    return grid.nearest[np.ravel_multi_index(cell.T, grid.dims)]
 
 
 def leafy(seed, n):
@@ -85,7 +79,7 @@ def test_one_point_and_equal_points(n_equal):
     bins = make_bins(points)
     distance, _ = nearest_distances(bins, *columns(queries))
     np.testing.assert_allclose(distance, [0.0, 1.5, 997.0], rtol=ROUNDING)
-    which, _ = lookup(nearest_grid(points, bins), queries)
+    which = lookup(nearest_grid(points), queries)
     assert np.all((which >= 0) & (which < n_equal))
 
 
@@ -126,40 +120,39 @@ def test_bins_hold_every_point_once_in_its_place(points, edge):
 def test_grid_answers_are_points_and_nearly_nearest(points, seed, cells, margin):
     """Both the query and its nearest point are at most half a diagonal further from the centre of the query's cell."""
     size = np.linalg.norm(np.ptp(points, axis=0)) + 2 * margin
-    grid = nearest_grid(points, make_bins(points), cell=size / cells, margin=margin)
+    grid = nearest_grid(points, cell=size / cells, margin=margin)
     cell = 1.0 / grid.inverse_cell
     high = grid.origin + grid.dims * cell
     assert np.all(grid.origin <= points.min(axis=0) - margin + SINGLE)
     assert np.all(high >= points.max(axis=0) + margin - SINGLE)
     queries = np.random.default_rng(seed).uniform(grid.origin, high, (1000, 3))
-    which, divided = lookup(grid, queries)
+    which = lookup(grid, queries)
     assert np.all((which >= 0) & (which < len(points)))
     excess = np.linalg.norm(queries - points[which], axis=1) - cKDTree(points).query(queries)[0]
-    diagonal = np.sqrt(3.0) * np.where(divided, cell / nearest.SUBDIVISION, cell)
-    assert np.all(excess <= diagonal + SINGLE)
+    assert np.all(excess <= np.sqrt(3.0) * cell + SINGLE)
 
 
-def test_grid_is_finest_where_the_cloud_is():
+def test_a_point_alone_in_its_cell_is_found_there():
+    """What ICP rests on: at a point of the cloud the answer is that point."""
     points = leafy(3, 300)
-    grid = nearest_grid(points, make_bins(points), cell=0.5, margin=4.0)
-    _, divided = lookup(grid, points)
-    assert divided.all()
-    corner = grid.origin[np.newaxis] + 1e-3  # 4 cm from the box of the points, 8 cells
-    assert not lookup(grid, corner)[1].any()
+    crowded = cKDTree(points).query_pairs(0.5, output_type="ndarray")[:, 1]
+    points = np.delete(points, crowded, axis=0)
+    grid = nearest_grid(points, cell=0.25, margin=1.0)
+    np.testing.assert_array_equal(lookup(grid, points), np.arange(len(points)))
 
 
 def test_a_query_outside_the_box_gets_a_point():
     points = leafy(4, 200)
-    grid = nearest_grid(points, make_bins(points))
+    grid = nearest_grid(points)
     far = np.array([[1e4, 0.0, 0.0], [0.0, -1e4, 0.0], [0.0, 0.0, 1e4], [-1e4, -1e4, -1e4]])
-    which, _ = lookup(grid, far)
+    which = lookup(grid, far)
     assert np.all((which >= 0) & (which < len(points)))
 
 
 @pytest.mark.parametrize("n", [1, 2, 50, 3000])
 def test_default_grid_keeps_to_its_size(n):
     points = leafy(5, n)
-    grid = nearest_grid(points, make_bins(points))
-    assert len(grid.coarse) == np.prod(grid.dims)
+    grid = nearest_grid(points)
+    assert len(grid.nearest) == np.prod(grid.dims)
     assert np.prod(grid.dims - 1) <= nearest.MAX_CELLS  # rounding up adds at most a cell a side
     np.testing.assert_array_equal(grid.points, np.column_stack([points, np.zeros(n)]).astype(np.float32))

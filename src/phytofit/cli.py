@@ -182,12 +182,11 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
     """
     _or_exit(lambda: prepare_folder(folder))
     species = load_species()
-    made = simulate(species, n_spheres=2, outlier_share=0.01, seed=seed)
+    made = simulate(species, n_spheres=2, seed=seed)
     cloud_file = folder / "phytomer_0001.ply"
     _or_exit(lambda: _write_simulated(made, species, folder, "phytomer_0001"))
     out.print(
-        f"Simulated a phytomer: {len(made.points)} points, 0.5 cm noise, two 6 cm spheres cut out, 1 % outliers, "
-        f"random pose.\nMeasuring it: phytofit fit {cloud_file} --units cm --out {folder}",
+        f"Simulated a phytomer: {len(made.points)} points, 0.5 cm noise, two 6 cm spheres cut out, random pose.\nMeasuring it: phytofit fit {cloud_file} --units cm --out {folder}",
         highlight=False,
     )
     cloud = _or_exit(lambda: read_cloud(cloud_file, "cm"))

@@ -69,7 +69,7 @@ class CrossEntropy:
             raise SettingError(f"elite_fraction: expected a number between 0 and 1, got {elite_fraction:g}")
         if not (np.isfinite(covariance_noise) and covariance_noise >= 0):
             raise SettingError(f"covariance_noise: expected 0 or more, got {covariance_noise:g}")
-        self.n_elite = int(np.ceil(elite_fraction * n_samples))
+        self.n_elite = int(np.ceil(round(elite_fraction * n_samples, 9)))  # 0.07 * 100 is 7, not a little more
         if self.n_elite < 2:
             raise SettingError(
                 f"samples: expected enough for two elite candidates, got {n_samples} samples "
