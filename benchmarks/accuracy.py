@@ -35,7 +35,8 @@ HAND = {
 def simulated_fit(job: tuple[int, int, bool]) -> tuple[np.ndarray, ...]:
     """True and fitted parameters (7,), true and fitted traits, flags of one phytomer under one seed."""
     seed, number, stem_above = job
-    made = phytofit.simulate(seed=100_000 + number)  # 5,000 points, 0.5 cm noise, random orientation
+    fixed = None if stem_above else {"stem_length_above": 0.0}
+    made = phytofit.simulate(fixed=fixed, seed=100_000 + number)  # 5,000 points, 0.5 cm noise, random orientation
     result = phytofit.fit(made.points, "cm", seed=seed, stem_above=stem_above, threads=1)
     x = np.zeros(7)
     x[: len(result.x)] = result.x
@@ -45,8 +46,13 @@ def simulated_fit(job: tuple[int, int, bool]) -> tuple[np.ndarray, ...]:
 
 def protocol(pool: ProcessPoolExecutor, seeds: int, phytomers: int) -> None:
     parameters = phytofit.Phytomer.PARAMETERS[:6]
-    for stem_above, model in ((False, "the paper's six parameters"), (True, "default: the stem may go on above")):
-        print(f"\nSimulated protocol, {phytomers} phytomers, {seeds} seeds, wide priors of sorghum.toml; {model}")
+    for stem_above, model in (
+        (False, "the paper's: six parameters, no stem above the leaf"),
+        (True, "the default: stem above the leaf, 5 to 15 cm"),
+    ):
+        print(
+            f"\nSimulated protocol, {phytomers} phytomers, {seeds} seeds, priors of sorghum.toml; {model}", flush=True
+        )
         jobs = [(seed, number, stem_above) for seed in range(seeds) for number in range(phytomers)]
         rows = list(progress(pool.map(simulated_fit, jobs, chunksize=1), len(jobs)))
         x, fitted, traits, estimates, flags = (np.array(column) for column in zip(*rows, strict=True))

@@ -1,4 +1,4 @@
-"""The cross-entropy search: Algorithm 1 by hand, its samples against truncated normals, its minima against known ones."""
+"""The cross-entropy search: Algorithm 1 by hand, samples against truncated normals, minima against known ones."""
 
 import math
 import pickle
@@ -53,13 +53,13 @@ def test_finds_the_minimum_of_a_shifted_correlated_quadratic(seed):
 
     search = run(CrossEntropy(space_of([0.0, 0.0, 0.0], [4.0] * 3), n_generations=25, seed=seed), objective)
     np.testing.assert_allclose(search.mean, minimum, atol=4.0 * FOUND)
-    assert search.history[-1].best_error == pytest.approx(11.0, abs=0.05)
+    assert 11.0 <= search.history[-1].best_error < 11.5  # the last noise, Z_0 / 25, spreads the candidates
     assert search.history[-1].threshold < search.history[0].threshold
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_finds_the_lowest_of_many_minima(seed):
-    """Rastrigin's function, its minimum at (2.7, -1.3) and hundreds of others, one apart, beside it."""
+    """Rastrigin's function: its minimum at (2.7, -1.3), and beside it others at every centimetre."""
     minimum = np.array([2.7, -1.3])
 
     def objective(xs):
@@ -67,7 +67,10 @@ def test_finds_the_lowest_of_many_minima(seed):
         return np.sum(d**2 + 10 * (1 - np.cos(2 * np.pi * d)), axis=1)
 
     search = run(CrossEntropy(space_of([0.0, 0.0], [3.0, 3.0]), n_generations=30, seed=seed), objective)
-    np.testing.assert_allclose(search.mean, minimum, atol=3.0 * FOUND)
+    best = min(search.history, key=lambda generation: generation.best_error)
+    np.testing.assert_allclose(best.best_x, minimum, atol=0.3)
+    # the noise keeps some candidates in the basins next to it, and the mean between them
+    np.testing.assert_allclose(search.mean, minimum, atol=0.5)
 
 
 def test_covariance_follows_a_correlated_valley():
@@ -315,7 +318,10 @@ def test_candidates_without_an_error_are_never_elite(bad):
         ({"covariance_noise": -0.5}, r"covariance_noise: expected 0 or more, got -0\.5"),
         ({"covariance_noise": np.nan}, r"covariance_noise: expected 0 or more, got nan"),
         ({"covariance_noise": np.inf}, r"covariance_noise: expected 0 or more, got inf"),
-        ({"n_samples": 10}, r"samples: expected enough for two elite candidates, got 10 samples with elite_fraction 0\.1"),
+        (
+            {"n_samples": 10},
+            r"samples: expected enough for two elite candidates, got 10 samples with elite_fraction 0\.1",
+        ),
         ({"n_samples": 0}, r"samples: expected enough for two elite candidates, got 0"),
         ({"n_samples": -20}, r"samples: expected enough for two elite candidates, got -20"),
         ({"mean": [1.0, 2.0]}, r"mean: expected 3 numbers, got shape \(2,\)"),

@@ -168,7 +168,8 @@ def test_no_plants(k):
 def test_frames_are_rotations_along_the_axis(xs):
     for organ in grow(xs):
         frame = organ.frame
-        np.testing.assert_allclose(frame @ np.swapaxes(frame, -1, -2), np.tile(np.eye(3), (len(frame), 1, 1)), atol=1e-9)
+        products = frame @ np.swapaxes(frame, -1, -2)
+        np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-9)
         np.testing.assert_allclose(np.linalg.det(frame), 1.0, atol=1e-9)
         along = np.diff(organ.axis, axis=0) / organ.segment_lengths[:, np.newaxis]
         np.testing.assert_allclose(frame[:, :, 0], along, atol=1e-9)

@@ -160,7 +160,7 @@ def test_one_seed_gives_one_cloud_and_another_seed_another():
 def test_a_little_more_of_a_plant_moves_points_a_little():
     """Common random numbers: a millimetre more of leaf moves no point by more than a few millimetres."""
     points, organ = draw(grow(X))
-    longer, organ_longer = draw(grow(X + [0, 0, 0, 0.1, 0, 0, 0]))
+    longer, organ_longer = draw(grow(X + np.array([0, 0, 0, 0.1, 0, 0, 0])))
     same = organ == organ_longer
     assert same.mean() > 0.99
     assert np.linalg.norm(points - longer, axis=1)[same].max() < 0.5
@@ -207,4 +207,3 @@ def test_twice_the_pieces_give_the_same_cloud():
     coarse, _ = draw(grow(STRAIGHT))
     fine, _ = draw(grow(STRAIGHT, n_pieces=60))
     assert np.sqrt(np.mean(np.sum((coarse - fine) ** 2, axis=1))) < 0.15
-

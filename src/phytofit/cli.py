@@ -186,7 +186,8 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
     cloud_file = folder / "phytomer_0001.ply"
     _or_exit(lambda: _write_simulated(made, species, folder, "phytomer_0001"))
     out.print(
-        f"Simulated a phytomer: {len(made.points)} points, 0.5 cm noise, two 6 cm spheres cut out, random pose.\nMeasuring it: phytofit fit {cloud_file} --units cm --out {folder}",
+        f"Simulated a phytomer: {len(made.points)} points, 0.5 cm noise, two 6 cm spheres cut out, "
+        f"random pose.\nMeasuring it: phytofit fit {cloud_file} --units cm --out {folder}",
         highlight=False,
     )
     cloud = _or_exit(lambda: read_cloud(cloud_file, "cm"))

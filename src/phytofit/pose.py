@@ -18,6 +18,7 @@ FloatArray = NDArray[np.float64]
 N_POINTS = 2000  # of the cloud, evenly by index: enough to see a stem by
 N_SEEDS = 160
 N_LINES = 2  # different lines that are handed on
+LEAST_SCORE = 0.3  # cm; a sphere or a wall gets 0.2 by chance, a phytomer with little left of its stem 0.4
 LEAST_SHARE = 0.6  # of the best line's score: a line that looks less like a stem is not handed on
 LEAST_ROUNDNESS = 0.3  # thin over wide of a section: a blade in 0.5 cm of noise reaches about 0.4, a stem 0.7 to 1
 MAX_SLOPE = 2.0  # of a leaf's base, rise over run, when it is followed into the stem
@@ -138,7 +139,7 @@ def _lines(points: FloatArray, radius: float) -> list[tuple[FloatArray, FloatArr
     lines.sort(key=lambda line: -line[0])
     kept: list[tuple[FloatArray, FloatArray]] = []
     for score, center, axis in lines:
-        if score <= 0 or len(kept) == N_LINES or score < LEAST_SHARE * lines[0][0]:
+        if score < LEAST_SCORE or len(kept) == N_LINES or score < LEAST_SHARE * lines[0][0]:
             break
         if all(_differ(center, axis, other, direction, radius) for other, direction in kept):
             # the sign of an eigenvector is arbitrary: take it from the points, so that it turns with them

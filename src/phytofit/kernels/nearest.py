@@ -32,8 +32,8 @@ MAX_BINS = 32_768
 class NearestGrid(NamedTuple):
     """Index of (about) the nearest point for every cell of a box around a cloud.
 
-    ``nearest`` (nx * ny * nz,) int32 in C order; ``dims`` (3,) int64 cells a side; ``origin`` (3,) the box's low corner;
-    ``inverse_cell`` 1 / edge of a cell; ``points`` (m, 4) float32, the cloud, padded to one load a point.
+    ``nearest`` (nx * ny * nz,) int32 in C order; ``dims`` (3,) int64 cells a side; ``origin`` (3,) the box's low
+    corner; ``inverse_cell`` 1 / edge of a cell; ``points`` (m, 4) float32, the cloud, padded to one load a point.
     Positions outside the box take the answer of the nearest cell.
     """
 
