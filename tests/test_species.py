@@ -100,7 +100,7 @@ def test_bounds_that_are_left_out_are_infinite():
     assert space.lower[space.index("stem_diameter")] > 0
 
 
-WIDTH = "[parameters.leaf_width]\nunit = \"cm\"\nmean = 6.0\nstd = 2.0\nlower = 0.3\nrange = [4.0, 8.0]"
+WIDTH = '[parameters.leaf_width]\nunit = "cm"\nmean = 6.0\nstd = 2.0\nlower = 0.3\nrange = [4.0, 8.0]'
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,9 @@ N_LINES = 2  # different lines that are handed on
 LEAST_SCORE = 0.3  # cm; a sphere or a wall gets 0.2 by chance, a phytomer with little left of its stem 0.4
 LEAST_SHARE = 0.6  # of the best line's score: a line that looks less like a stem is not handed on
 LEAST_ROUNDNESS = 0.3  # thin over wide of a section: a blade in 0.5 cm of noise reaches about 0.4, a stem 0.7 to 1
+MAX_AROUND = (
+    1.5  # points close around a stem, times those on it: a leaf.s base gives up to about 1, evenly spread noise 3
+)
 MAX_SLOPE = 2.0  # of a leaf's base, rise over run, when it is followed into the stem
 MAX_TILT_COSINE = 0.34  # with `up` given, a stem leans by less than 70 degrees
 
@@ -185,6 +188,9 @@ def _pose_on_line(points: FloatArray, center: FloatArray, axis: FloatArray, radi
     on_stem = distance < min(1.6 * stem_radius + 0.1 * radius, radius)
     ends = np.quantile(along[on_stem], [0.01, 0.99])
     inside = (along > ends[0] - radius) & (along < ends[1] + radius)
+    around = inside & ~on_stem & (distance < 2.0 * radius)
+    if around.sum() > MAX_AROUND * (inside & on_stem).sum():  # the line runs through a heap of points, not along a stem
+        return None
     leaf = distance > 1.6 * stem_radius + 0.25 * radius
     if leaf.sum() < max(20, 0.05 * len(points)):
         return None

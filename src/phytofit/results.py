@@ -36,21 +36,17 @@ def trait_table(name: str, traits: Iterable[Trait]) -> pd.DataFrame:
 
 
 def result_names(paths: Sequence[Path]) -> list[str]:
-    """A name for each cloud: its file's stem; where two are alike, with the parent folder's name in front, and if
-    that is not enough with the file's ending behind, then with a number."""
-    for make in (
-        lambda p: p.stem,
-        lambda p: f"{p.resolve().parent.name}_{p.stem}",
-        lambda p: f"{p.resolve().parent.name}_{p.name.replace('.', '_')}",
+    """A name for each cloud: its file's stem; names that collide take the parent folder's name in front, then the
+    file's ending behind, then a number."""
+    folders = [path.resolve().parent.name for path in paths]
+    names = [path.stem for path in paths]
+    for longer in (
+        [f"{folder}_{path.stem}" for folder, path in zip(folders, paths, strict=True)],
+        [f"{folder}_{path.name.replace('.', '_')}" for folder, path in zip(folders, paths, strict=True)],
+        [f"{folder}_{path.stem}_{i}" for i, (folder, path) in enumerate(zip(folders, paths, strict=True), start=1)],
     ):
-        names = [make(path) for path in paths]
-        if len(set(names)) == len(names):
-            return names
-        stems = [path.stem for path in paths]
-        mixed = [name if stems.count(path.stem) > 1 else path.stem for name, path in zip(names, paths, strict=True)]
-        if len(set(mixed)) == len(mixed):
-            return mixed
-    return [f"{name}_{number}" for number, name in enumerate(names, start=1)]
+        names = [long if names.count(name) > 1 else name for name, long in zip(names, longer, strict=True)]
+    return names
 
 
 def prepare_folder(folder: Path) -> Path:

@@ -74,6 +74,11 @@ def simulate(
     for _ in range(n_spheres):
         keep = occlude(points, sphere_diameter_cm, random)
         points, labels = points[keep], labels[keep]
+        if len(points) == 0:
+            raise SettingError(
+                f"spheres: expected to leave some of the {n_points} points, but "
+                f"{n_spheres} of {sphere_diameter_cm:g} cm remove all"
+            )
     outliers = add_outliers(points, outlier_share, random)
     points = np.concatenate([points, outliers])
     labels = np.concatenate([labels, np.zeros(len(outliers), np.int64)])

@@ -1,0 +1,7 @@
+"""``python -m phytofit``."""
+
+from phytofit.cli import main
+
+__all__: list[str] = []
+
+main()

@@ -1,0 +1,177 @@
+"""The layout of the package: imports go one way, names are kept, files stay short."""
+
+import ast
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+import phytofit
+
+SOURCE = Path(phytofit.__file__).parent
+MOST_LINES = 500
+
+# From the top down.  A module may import from the layers below its own, and within its own package.
+LAYERS = [
+    {"__init__", "__main__"},
+    {"cli"},
+    {"results"},
+    {"plots", "report", "viewer", "export", "validation"},
+    {"batch"},
+    {"pipeline"},
+    {"recipe"},
+    {"fitting", "simulation", "segmentation", "reconstruct"},
+    {"objectives", "pose"},
+    {"distances"},
+    {"optimize", "traits"},
+    {"species"},
+    {"models"},
+    {"formats"},
+    {"cloud"},
+    {"kernels"},
+    {"parameters"},
+    {"errors"},
+]
+DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}
+
+FILES = sorted(SOURCE.rglob("*.py"))
+IDS = [str(path.relative_to(SOURCE)) for path in FILES]
+
+
+def module_of(path):
+    """Dotted name of a source file, phytofit and all."""
+    parts = path.relative_to(SOURCE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def part_of(module):
+    """What of phytofit a module belongs to: the name that stands in LAYERS."""
+    parts = module.split(".")
+    return parts[1] if len(parts) > 1 else "__init__"
+
+
+def imports_of(path):
+    package = module_of(path) if path.name == "__init__.py" else module_of(path).rpartition(".")[0]
+    return imports_in(path.read_text(encoding="utf-8"), package)
+
+
+def imports_in(text, package):
+    """Dotted names of the modules that a module of a package imports, wherever in it, relative ones resolved."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                above = package.split(".")[: len(package.split(".")) - node.level + 1]
+                base = ".".join([*above, base] if base else above)
+            if base == "phytofit":  # the names may be modules
+                for alias in node.names:
+                    yield f"phytofit.{alias.name}" if alias.name in DEPTH else "phytofit"
+            else:
+                yield base
+
+
+def third_party(path):
+    names = {name.split(".")[0] for name in imports_of(path)}
+    return names - set(sys.stdlib_module_names) - {"phytofit"}
+
+
+def own(path):
+    return {part_of(name) for name in imports_of(path) if name.split(".")[0] == "phytofit"}
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("import numpy as np, os.path", {"numpy", "os.path"}),
+        ("import phytofit.models", {"phytofit.models"}),
+        ("from phytofit.models.organs import mesh", {"phytofit.models.organs"}),
+        ("from phytofit import fitting, fit", {"phytofit.fitting", "phytofit"}),
+        ("from . import nearest", {"phytofit.kernels"}),
+        ("from .nearest import Bins", {"phytofit.kernels.nearest"}),
+        ("from ..models import mesh", {"phytofit.models"}),
+        ("from .. import pose", {"phytofit.pose"}),
+        ("def f():\n    if f:\n        from phytofit.cli import main", {"phytofit.cli"}),
+    ],
+)
+def test_the_walk_sees_every_way_to_import(text, expected):
+    assert set(imports_in(text, "phytofit.kernels")) == expected
+
+
+@pytest.mark.parametrize("path", FILES, ids=IDS)
+def test_every_module_has_its_layer(path):
+    assert part_of(module_of(path)) in DEPTH, "put the new module where it belongs in LAYERS"
+
+
+@pytest.mark.parametrize("path", FILES, ids=IDS)
+def test_imports_go_one_way(path):
+    me = part_of(module_of(path))
+    inside = {me} if path.parent != SOURCE else set()
+    upwards = {name for name in own(path) - inside if DEPTH[name] <= DEPTH[me]}
+    assert not upwards, f"{me} imports {', '.join(sorted(upwards))}, which stand beside or above it"
+
+
+@pytest.mark.parametrize("path", sorted((SOURCE / "optimize").glob("*.py")), ids=lambda path: path.name)
+def test_the_optimiser_has_never_heard_of_plants(path):
+    assert own(path) <= {"optimize", "errors", "parameters"}
+    assert third_party(path) <= {"numpy", "scipy"}
+
+
+@pytest.mark.parametrize("path", sorted((SOURCE / "kernels").glob("*.py")), ids=lambda path: path.name)
+def test_kernels_know_numpy_only(path):
+    assert own(path) <= {"kernels"}
+    assert third_party(path) <= ({"numpy", "numba"} if path.name == "compiling.py" else {"numpy"})
+
+
+@pytest.mark.parametrize("name", ["report", "viewer", "plots", "export"])
+def test_what_shows_results_never_sees_the_optimiser(name):
+    for path in [SOURCE / f"{name}.py", *(SOURCE / name).glob("*.py")]:
+        if path.exists():
+            assert not own(path) & {"optimize", "objectives"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=IDS)
+def test_files_stay_short(path):
+    assert len(path.read_text(encoding="utf-8").splitlines()) <= MOST_LINES
+
+
+def is_sorted(names):
+    """Plainly, or as ruff sorts (RUF022): constants, then classes, then functions, each alphabetically."""
+
+    def isort_key(name):
+        return (0 if name.isupper() else 1 if name[:1].isupper() else 2), name
+
+    return list(names) in (sorted(names), sorted(names, key=str.lower), sorted(names, key=isort_key))
+
+
+def test_public_names():
+    names = phytofit.__all__
+    assert len(names) == len(set(names))
+    assert is_sorted(names)
+    for name in names:
+        assert getattr(phytofit, name) is not None
+
+
+@pytest.mark.parametrize(
+    "path", [p for p in FILES if p.name != "__main__.py"], ids=[i for i in IDS if "__main__" not in i]
+)
+def test_every_module_names_what_it_offers(path):
+    module = importlib.import_module(module_of(path))
+    if module.__name__ == "phytofit.kernels":  # a bare package: its modules are what it offers
+        assert not hasattr(module, "__all__")
+        return
+    names = module.__all__
+    assert len(names) == len(set(names))
+    assert is_sorted(names)
+    for name in names:
+        assert hasattr(module, name)
+
+
+def test_public_names_come_from_modules_that_offer_them():
+    tree = ast.parse((SOURCE / "__init__.py").read_text(encoding="utf-8"))
+    for node in tree.body:
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("phytofit."):
+            offered = importlib.import_module(node.module).__all__
+            assert {alias.name for alias in node.names} <= set(offered), node.module

@@ -1,0 +1,263 @@
+"""The command line as a user meets it: tables, files, one line an error, exit codes; nothing half-written."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pandas as pd
+import pytest
+import trimesh
+from typer.testing import CliRunner
+
+import phytofit
+from phytofit.cli import app
+from phytofit.results import COLUMNS, result_names
+
+FAST = ["--samples", "60", "--points", "500", "--generations", "3"]
+FILES = {"fit.json", "traits.csv", "model.ply", "fit.png", "convergence.png"}
+
+
+def run(*arguments):
+    return CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb"}).invoke(app, [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def clouds(tmp_path_factory):
+    """Two simulated clouds, written by `phytofit simulate`."""
+    folder = tmp_path_factory.mktemp("simulated")
+    done = run("simulate", "-n", "2", "--points", "1500", "--noise", "0.2", "--set", "leaf_length=50", "--out", folder)
+    assert done.exit_code == 0, done.output
+    return folder
+
+
+def test_simulate_writes_clouds_and_their_truth(clouds):
+    names = {p.name for p in clouds.iterdir()}
+    expected = {f"phytomer_000{i}.{end}" for i in (1, 2) for end in ("ply", "json")}
+    assert names == expected | {"truth.csv"}
+    truth = json.loads((clouds / "phytomer_0001.json").read_text())
+    assert truth["parameters"]["leaf_length"] == 50.0
+    table = pd.read_csv(clouds / "truth.csv")
+    assert list(table.columns) == COLUMNS
+    row = table[(table.cloud == "phytomer_0001") & (table.trait == "leaf_length")].iloc[0]
+    assert row.value == pytest.approx(truth["traits"]["leaf_length"], rel=1e-5)
+    assert row.method == "truth"
+    cloud = phytofit.read_cloud(clouds / "phytomer_0001.ply", "cm")
+    assert len(cloud) == 1500
+    assert set(np.unique(cloud.labels)) == {1, 2}
+
+
+def test_fit_measures_several_clouds_and_writes_everything(clouds, tmp_path):
+    done = run("fit", clouds / "phytomer_0001.ply", clouds / "phytomer_0002.ply", "-u", "cm", *FAST, "-o", tmp_path)
+    assert done.exit_code == 0, done.output
+    assert "leaf_length" in done.output
+    assert "2 of 2 clouds measured" in done.output
+    assert {p.name for p in tmp_path.iterdir()} == {"phytomer_0001", "phytomer_0002", "traits.csv"}
+    for name in ("phytomer_0001", "phytomer_0002"):
+        folder = tmp_path / name
+        assert {p.name for p in folder.iterdir()} == FILES
+        stored = json.loads((folder / "fit.json").read_text())
+        assert stored["cloud"] == name
+        assert stored["parameters"]["leaf_length"] == {
+            "value": pytest.approx(50.0, abs=8.0),
+            "low": None,
+            "high": None,
+            "unit": "cm",
+        }
+        assert len(stored["history"]) == 3
+        assert stored["settings"]["fit"]["n_samples"] == 60
+        assert stored["settings"]["fit"]["species"] == "sorghum"
+        assert stored["phytofit"]
+        assert len(stored["input"]["sha256"]) == 64
+        table = pd.read_csv(folder / "traits.csv")
+        assert list(table.columns) == COLUMNS
+        assert table[["low", "high"]].isna().all().all()
+        assert set(table.method) == {"paper"}
+        for picture in ("fit.png", "convergence.png"):
+            image = matplotlib.image.imread(folder / picture)
+            assert image.shape[0] > 600
+            assert image[..., :3].std() > 0.05  # not blank
+    together = pd.read_csv(tmp_path / "traits.csv")
+    assert list(together.cloud.unique()) == ["phytomer_0001", "phytomer_0002"]
+
+
+def test_model_is_in_the_frame_and_unit_of_the_input(clouds, tmp_path):
+    cloud = phytofit.read_cloud(clouds / "phytomer_0001.ply", "cm")
+    far = np.array([500.0, -300.0, 200.0])
+    trimesh.PointCloud(cloud.points * 10.0 + far).export(tmp_path / "in_mm.ply")
+    done = run("fit", tmp_path / "in_mm.ply", "-u", "mm", *FAST, "-o", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    model = trimesh.load(tmp_path / "out" / "in_mm" / "model.ply")
+    read = phytofit.read_cloud(tmp_path / "in_mm.ply", "mm")
+    np.testing.assert_allclose(model.bounds, np.array([read.points.min(0), read.points.max(0)]) * 10.0, atol=60.0)
+
+
+def test_same_seed_same_bytes_with_one_and_two_threads(clouds, tmp_path):
+    for threads in (1, 2):
+        done = run(
+            "fit", clouds / "phytomer_0001.ply", "-u", "cm", *FAST, "--threads", threads, "-o", tmp_path / str(threads)
+        )
+        assert done.exit_code == 0, done.output
+    for name in FILES:
+        a, b = ((tmp_path / t / "phytomer_0001" / name).read_bytes() for t in ("1", "2"))
+        assert a == b, name
+
+
+def test_one_bad_cloud_does_not_stop_the_others(clouds, tmp_path):
+    bad = tmp_path / "bad.ply"
+    bad.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9999\nproperty float x\nend_header\n1\n")
+    done = run("fit", bad, clouds / "phytomer_0001.ply", "-u", "cm", *FAST, "-o", tmp_path / "out")
+    assert done.exit_code == 1
+    assert "1 of 2 clouds measured" in done.output
+    assert "bad.ply" in done.stderr
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"phytomer_0001", "traits.csv"}
+
+
+BAD_CLOUDS = {
+    "missing.ply": (None, "no such file"),
+    "empty.ply": (b"", "empty"),
+    "text.ply": (b"this is no ply at all\n" * 50, "text.ply"),
+    "nan.xyz": (b"nan nan nan\n" * 200, "nan.xyz"),
+    "flat.txt": (b"1.0 2.0\n" * 200, "found 2"),
+    "few.xyz": (b"1 2 3\n4 5 6\n", "100"),
+    "same.xyz": (b"1 2 3\n" * 200, "same.xyz"),
+    "what.docx": (b"PK", ".docx"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_CLOUDS)
+def test_bad_clouds_get_one_line_and_exit_code_2(tmp_path, name):
+    content, text = BAD_CLOUDS[name]
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    done = run("fit", tmp_path / name, "--units", "cm", *FAST, "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert done.stderr.startswith("error: ")
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert name in done.stderr
+    assert text in done.stderr
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_folder_and_a_bare_stem_are_refused(tmp_path):
+    folder = tmp_path / "scan.ply"
+    folder.mkdir()
+    done = run("fit", folder, "-u", "cm", "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "is a folder" in done.stderr
+    random = np.random.default_rng(0)
+    angle = random.uniform(0, 2 * np.pi, 2000)
+    stem = np.stack([1.5 * np.cos(angle), 1.5 * np.sin(angle), random.uniform(0, 30, 2000)], axis=1)
+    np.savetxt(tmp_path / "stem.xyz", stem)
+    done = run("fit", tmp_path / "stem.xyz", "-u", "cm", *FAST, "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "stem.xyz: no stem with a leaf was found" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--units", "inch"], "inch"),
+        ([], "no unit given"),
+        (["--units", "mm"], "cm"),
+        (["--units", "cm", "--up", "north"], "up: expected one of"),
+        (["--units", "cm", "--species", "nowhere.toml"], "nowhere.toml"),
+        (["--units", "cm", "--samples", "-3"], "samples"),
+        (["--units", "cm", "--points", "7"], "points"),
+        (["--units", "cm", "--generations", "0"], "generations"),
+        (["--units", "cm", "--method", "guess"], "method"),
+        (["--units", "cm", "--distance", "taxicab"], "distance"),
+        (["--units", "cm", "--labels", "organ"], "organ"),
+    ],
+)
+def test_bad_settings_get_one_line_and_exit_code_2(clouds, tmp_path, arguments, text):
+    done = run("fit", clouds / "phytomer_0001.ply", *arguments, "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert text in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out" / "phytomer_0001").exists()
+
+
+def test_results_can_not_be_written_into_a_file(clouds, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    done = run("fit", clouds / "phytomer_0001.ply", "-u", "cm", *FAST, "-o", tmp_path / "file")
+    assert done.exit_code == 2
+    assert "results can't be written there" in done.stderr
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_second_run_replaces_the_first_as_a_whole(clouds, tmp_path):
+    for seed in (0, 1):
+        arguments = ["-u", "cm", *FAST, "--seed", seed, "-o", tmp_path]
+        assert run("fit", clouds / "phytomer_0001.ply", *arguments).exit_code == 0
+    assert {p.name for p in tmp_path.iterdir()} == {"phytomer_0001", "traits.csv"}
+    assert json.loads((tmp_path / "phytomer_0001" / "fit.json").read_text())["seed"] == 1
+
+
+def test_names_that_collide_take_the_parent_folder():
+    paths = [Path("a/x.ply"), Path("b/x.ply"), Path("b/y.ply")]
+    assert result_names(paths) == ["a_x", "b_x", "y"]
+    assert result_names([Path("a/x.ply"), Path("a/x.pcd")]) == ["a_x_ply", "a_x_pcd"]
+    assert len(set(result_names([Path("a/x.ply"), Path("a/x.ply")]))) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["--noise", "-1"], "noise"),
+        (["--noise", "nan"], "noise"),
+        (["--outliers", "1.5"], "outliers"),
+        (["--sphere-diameter", "0"], "sphere diameter"),
+        (["--set", "leaf_length"], "NAME=NUMBER"),
+        (["--set", "leaf_size=3"], "leaf_size"),
+        (["--set", "leaf_length=-4"], "leaf_length"),
+        (["--points", "0"], "points"),
+    ],
+)
+def test_bad_simulations_are_refused(tmp_path, arguments, text):
+    done = run("simulate", *arguments, "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert text in done.stderr
+    assert not list((tmp_path / "out").glob("*")) if (tmp_path / "out").exists() else True
+
+
+def test_recipe_prints_every_setting_as_json():
+    done = run("recipe")
+    assert done.exit_code == 0
+    recipe = json.loads(done.output)
+    assert recipe["fit"]["n_samples"] == 500
+    assert recipe["fit"]["n_points"] == 5000
+    assert recipe["fit"]["n_generations"] == 10
+    assert recipe["fit"]["elite_fraction"] == 0.1
+    assert recipe["objective"]["tilts_deg"]
+
+
+def test_help_teaches():
+    top, fit = run("--help").output, run("fit", "--help").output
+    for command in ("fit", "simulate", "demo", "recipe"):
+        assert command in top
+    assert "phytofit fit leaf.ply --units cm" in fit
+    assert "--up" in fit
+
+
+def test_demo_as_installed_prints_estimate_beside_truth(tmp_path):
+    """The real thing in a process of its own, without a screen."""
+    environment = {k: v for k, v in os.environ.items() if k != "DISPLAY"}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-m", "phytofit", "demo", "--out", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        env=environment,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Estimate beside truth" in done.stdout
+    rows = [line.split("│") for line in done.stdout.splitlines() if "│" in line]
+    shown = {row[1].strip(): (float(row[2]), float(row[3])) for row in rows}
+    estimate, truth = shown["leaf_length"]
+    assert estimate == pytest.approx(truth, abs=4.0)
+    assert (tmp_path / "phytomer_0001" / "fit.png").stat().st_size > 20_000
