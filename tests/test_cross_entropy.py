@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy import stats
 from scipy.spatial.transform import Rotation
@@ -139,6 +139,8 @@ def test_a_tiny_case_in_numbers():
 
 
 @given(st.integers(2, 2000), st.sampled_from(["0.01", "0.05", "0.07", "0.1", "0.15", "0.25", "0.3", "0.55", "0.9"]))
+@example(100, "0.07")  # 0.07 * 100 is a little more than 7 in floating point
+@example(500, "0.1")
 def test_elite_is_the_ceiling_of_its_share(n_samples, share):
     expected = math.ceil(Fraction(share) * n_samples)
     if expected < 2:

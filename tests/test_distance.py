@@ -74,6 +74,27 @@ def test_clouds_of_thousands_of_points(n_source, shift):
     np.testing.assert_allclose(hausdorff(columns(source), grid, bins), max(forward, backward), rtol=SINGLE)
 
 
+@pytest.mark.parametrize("noise", [0.05, 0.2, 0.5, 5.0])
+@given(seed=st.integers(0, 2**32 - 1), cells=st.integers(1, 4))
+def test_however_coarse_the_grid_the_distance_is_exact(noise, seed, cells):
+    """The grid gives bounds only: with a few cells over the whole cloud they are poor, and the answer the same."""
+    random = np.random.default_rng(seed)
+    target = random.uniform(0, 5, (60, 3)).astype(np.float32).astype(float)
+    source = (target + random.normal(0, noise, (60, 3))).astype(np.float32).astype(float)
+    coarse, bins = nearest_grid(target, cell=5.0 / cells), make_bins(target)
+    forward, backward = both_ways(source, target)
+    np.testing.assert_allclose(directed_hausdorff(columns(source), coarse, bins), (forward, backward), rtol=SINGLE)
+    np.testing.assert_allclose(hausdorff(columns(source), coarse, bins), max(forward, backward), rtol=SINGLE)
+
+
+def test_a_point_in_a_bin_with_another_may_still_be_the_furthest():
+    """(1.1, 1.1, 1.1) is 1.9 cm from the source's first point, in the cube beside it, and no other point is as far."""
+    source = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
+    target = np.array([[-1.2, 0.0, 0.0], [1.1, 1.1, 1.1], [10.0, 1.2, 0.0]])
+    grid, bins = searchable(target)
+    np.testing.assert_allclose(hausdorff(columns(source), grid, bins), 1.1 * np.sqrt(3.0), rtol=SINGLE)
+
+
 def test_directions_differ_and_the_larger_counts():
     """A part of a cloud lies on the whole; the whole does not lie on the part."""
     whole = leaf_like(3, 400)

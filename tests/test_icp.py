@@ -237,6 +237,15 @@ def test_mixing_is_as_good_as_plain_icp():
     assert np.max(ratios) <= 1.0 + 3 * WORSE_BY_MIXING
 
 
+def test_no_more_than_the_largest_memory_is_mixed():
+    for seed in range(8):
+        problem = noisy(seed, 20.0, n=800, noise=0.0)
+        grid, _ = look_up(problem)
+        most, more = (register(problem, grid, memory, 60) for memory in (MAX_MEMORY, 10 * MAX_MEMORY))
+        np.testing.assert_array_equal(more[0], most[0])
+        np.testing.assert_array_equal(more[1], most[1])
+
+
 def test_mixing_is_nearer_after_few_rounds():
     """Where the source slides along a smooth surface plain ICP creeps."""
     ratios = []

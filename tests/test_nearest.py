@@ -60,7 +60,9 @@ def test_exact_search_agrees_with_a_tree(points, seed, reach):
 
 def test_exact_search_on_a_larger_cloud():
     points = leafy(0, 4000)
-    queries = np.random.default_rng(1).uniform(-60, 60, (2000, 3)).astype(np.float32).astype(float)
+    random = np.random.default_rng(1)
+    far, near = random.uniform(-60, 60, (2000, 3)), points + random.normal(0, 0.3, points.shape)
+    queries = np.concatenate([far, near]).astype(np.float32).astype(float)
     distance, index = nearest_distances(make_bins(points), *columns(queries))
     expected, which = cKDTree(points).query(queries)
     np.testing.assert_allclose(distance, expected, rtol=ROUNDING)

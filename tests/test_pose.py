@@ -33,7 +33,7 @@ def truth(cloud):
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_starts_near_the_truth_in_any_orientation(noise, above):
     near, first_is_up = [], []
-    for seed in range(16):
+    for seed in range(12):
         cloud = simulate(noise_cm=noise, fixed={"stem_length_above": above}, seed=seed)
         up, collar = truth(cloud)
         starts = start_poses(cloud.points, STEM_RADIUS)
@@ -158,7 +158,15 @@ def line(random):
     return random.uniform(-1, 1, (N, 3)) * [25.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("shape", [sphere, bare_stem, wall, strip, bent_strip, line])
+def ball(random):
+    return sphere(random) * random.uniform(0, 1, (N, 1)) ** (1 / 3)
+
+
+def heap(random):
+    return random.normal(0, 5, (N, 3))
+
+
+@pytest.mark.parametrize("shape", [sphere, bare_stem, wall, strip, bent_strip, line, ball, heap])
 @pytest.mark.parametrize("noise", [0.0, 0.2])
 def test_what_is_no_phytomer_has_no_start(shape, noise):
     for seed in range(3):

@@ -101,6 +101,14 @@ def test_along_a_cone(low, high):
     assert passes(stats.kstest(points[:, 2], passed).pvalue)
 
 
+def test_pieces_of_a_tube_get_points_by_their_slanting_sides():
+    """A flat ring from radius 4 to 1, then 5 cm of tube of radius 1: areas of 15 pi and 10 pi."""
+    axis = np.array([[0, 0, 0], [0, 0, 1e-6], [0, 0, 5]], float)
+    tube = Organ(STEM, axis, frames_along(axis, np.array([0.0, 1.0, 0.0])), np.array([4.0, 1.0, 1.0]))
+    points, _ = draw([tube])
+    assert np.mean(points[:, 2] < 1e-5) == pytest.approx(15 / 25, abs=0.005)
+
+
 @pytest.mark.parametrize("x", [X, STRAIGHT, np.array([1.0, 5.0, 80.0, 30.0, 9.0, -4.0, 0.0])])
 def test_pieces_get_points_by_the_area_of_their_mesh(x):
     """Stem and every piece of the leaf, bent or not, against the areas of trimesh's triangles."""

@@ -6,6 +6,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from phytofit.fitting import Fit
@@ -37,6 +38,7 @@ def plot_fit(result: Fit, title: str = "") -> Figure:
         for organ in organs:
             _draw(ax, organ, a, b)
         ax.set_aspect("equal")
+        ax.xaxis.set_major_locator(MaxNLocator(nbins=max(1, round(9 * span[a] / max(widths)))))
         ax.set_xlabel(f"{'xyz'[a]} ({unit})")
         ax.set_ylabel(f"{'xyz'[b]} ({unit})")
         ax.set_title(name, fontsize=10)

@@ -226,12 +226,13 @@ def icp(source, target, r_start, t_start, max_iterations, tolerance, memory):
     r_start, t_start : (3, 3), (3,) start pose: a source point p lies at ``r p + t``.
     max_iterations : rounds of matching at most.
     tolerance : converged when a round moves the pose by less than this (length; rotation times RMS radius).
-    memory : poses mixed (0: plain ICP), at most `MAX_MEMORY`.
+    memory : poses mixed (0: plain ICP); no more than `MAX_MEMORY` are.
 
     Returns
     -------
     r (3, 3), t (3,), mse of the last matching, iterations, converged
     """
+    memory = min(memory, MAX_MEMORY)
     n = source.shape[1]
     square = 0.0
     for a in range(3):

@@ -1,0 +1,85 @@
+"""The benchmarks run; their yardstick is plain ICP."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+SAME = 1e-9  # cm; the same sums in the same order
+
+
+def run(script, *arguments):
+    done = subprocess.run(
+        [sys.executable, BENCHMARKS / script, *arguments], capture_output=True, text=True, timeout=600, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def load_peers():
+    spec = importlib.util.spec_from_file_location("peers", BENCHMARKS / "peers.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def clouds():
+    """A patch 8 by 3 cm as the reference, and other points of it, turned and shifted a little."""
+    random = np.random.default_rng(0)
+    u, v = random.uniform(-1, 1, (2, 700))
+    patch = np.stack([4 * u, 1.5 * v, u**2 + 0.3 * u * v], axis=1)
+    c, s = np.cos(0.15), np.sin(0.15)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return patch[:400] @ turn.T + [0.3, -0.2, 0.4], patch[400:]
+
+
+def test_speed_benchmark_runs():
+    said = run("speed.py", "--quick")
+    for title in ("Table I:", "Equal work:", "A whole search:", "Floor:", "Agreement:"):
+        assert title in said
+
+
+def test_speed_benchmark_runs_one_part():
+    said = run("speed.py", "table1", "--quick")
+    assert "Table I:" in said
+    assert "Agreement:" not in said
+
+
+@pytest.mark.long
+def test_accuracy_benchmark_runs():
+    said = run("accuracy.py", "protocol", "--seeds", "1", "--phytomers", "2")
+    assert said.count("leaf_length") == 4  # parameter and trait, with and without stem above
+
+
+@pytest.mark.parametrize("rounds", [1, 5, 60])
+def test_yardstick_is_plain_icp(clouds, rounds):
+    peers = load_peers()
+    points, reference = clouds
+    plain = peers.scipy_peer(reference)
+    pose, _ = plain.align(points, np.eye(4), rounds)
+    end = peers.icp_to_rest(points, reference, cKDTree(reference), np.eye(4), max_iterations=rounds, tolerance_cm=0.0)
+    np.testing.assert_allclose(end.pose, pose, atol=SAME)
+    assert end.error == pytest.approx(plain.distance(points, pose), abs=SAME)
+
+
+def test_yardstick_takes_the_least_of_its_starts(clouds):
+    peers = load_peers()
+    points, reference = clouds
+    job = (points, np.zeros(3), reference, [np.eye(4)], 4, 0)
+    error, least = peers.yardstick(job)
+    start = peers.icp_to_rest(points, reference, cKDTree(reference), np.eye(4))
+    assert least <= min(error, start.error)
+
+
+def test_peers_align_alike(clouds):
+    peers = load_peers()
+    points, reference = clouds
+    ends = [peer.align(points, np.eye(4), 200) for peer in map(peers.small_gicp_peer, [reference])]
+    ends.append(peers.scipy_peer(reference).align(points, np.eye(4), 200))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=0.02)  # Gauss-Newton steps and Kabsch's, both at rest
