@@ -123,24 +123,35 @@ def icp_to_rest(
 ) -> AtRest:
     """Plain ICP of points (n, 3) until a round moves them by less than `tolerance_cm`, root mean square.
 
-    The matches are exact, but a match is looked for anew only where it may have changed: where the point has moved,
-    since its last look-up, by half of what its second nearest neighbour was further away than its nearest.
+    The matches are exact, but they are looked for no more often than they may have changed.  No match changes while
+    its point is within half of what the second nearest is further away than the nearest; and it is one of the few
+    nearest of the last look-up in the tree as long as one of these is nearer than any other can have become.
     """
     r, t = pose[:3, :3], pose[:3, 3]
     moved = points @ r.T + t
+    few = min(8, len(reference) - 1)  # neighbours kept of each point
     match = np.empty(len(points), int)
+    near = np.zeros((len(points), few), int)
+    others = np.full(len(points), -np.inf)  # distance of the nearest point that is not kept, at the last look-up
     slack = np.full(len(points), -1.0)
-    asked_at = moved.copy()
+    asked_at, checked_at = moved.copy(), moved.copy()
     for _ in range(max_iterations):
-        stale = np.flatnonzero(np.linalg.norm(moved - asked_at, axis=1) >= slack)
-        if len(stale):
-            distance, index = tree.query(moved[stale], k=2)
-            match[stale] = index[:, 0]
-            slack[stale] = 0.5 * (distance[:, 1] - distance[:, 0])
-            asked_at[stale] = moved[stale]
+        stale = np.flatnonzero(_lengths(moved - checked_at) >= slack)
+        distance = _lengths(reference[near[stale]] - moved[stale, np.newaxis])
+        gap = others[stale] - _lengths(moved[stale] - asked_at[stale])
+        lost = np.flatnonzero(distance.min(axis=1) >= gap)
+        if len(lost):
+            which = stale[lost]
+            found, index = tree.query(moved[which], k=few + 1)
+            near[which], others[which], asked_at[which] = index[:, :few], found[:, few], moved[which]
+            distance[lost], gap[lost] = found[:, :few], found[:, few]
+        match[stale] = near[stale, distance.argmin(axis=1)]
+        two = np.partition(np.column_stack([distance, gap]), 1, axis=1)
+        slack[stale] = 0.5 * (two[:, 1] - two[:, 0])
+        checked_at[stale] = moved[stale]
         r, t = best_motion(points, reference[match])
         before, moved = moved, points @ r.T + t
-        if np.sqrt(np.mean(np.sum((moved - before) ** 2, axis=1))) < tolerance_cm:
+        if np.sqrt(np.mean(_lengths(moved - before) ** 2)) < tolerance_cm:
             break
     to_reference = tree.query(moved)[0]
     error = max(to_reference.max(), cKDTree(moved).query(reference)[0].max())
@@ -189,6 +200,11 @@ def as_pose(r: np.ndarray, t: np.ndarray) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = r, t
     return pose
+
+
+def _lengths(vectors: np.ndarray) -> np.ndarray:
+    """Of vectors (..., 3); faster than NumPy's norm."""
+    return np.sqrt(np.einsum("...i,...i->...", vectors, vectors))
 
 
 def _direction(random: np.random.Generator) -> np.ndarray:

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SAME = 1e-9  # cm; the same sums in the same order
+AT_REST = 1e-6  # cm; the source is a part of the reference
 
 
 def run(script, *arguments):
@@ -19,6 +20,11 @@ def run(script, *arguments):
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+def brute_hausdorff(points, reference):
+    distance = np.linalg.norm(points[:, np.newaxis] - reference, axis=2)
+    return max(distance.min(axis=0).max(), distance.min(axis=1).max())
 
 
 def load_peers():
@@ -80,6 +86,12 @@ def test_yardstick_takes_the_least_of_its_starts(clouds):
 def test_peers_align_alike(clouds):
     peers = load_peers()
     points, reference = clouds
-    ends = [peer.align(points, np.eye(4), 200) for peer in map(peers.small_gicp_peer, [reference])]
-    ends.append(peers.scipy_peer(reference).align(points, np.eye(4), 200))
-    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=0.02)  # Gauss-Newton steps and Kabsch's, both at rest
+    source, shift = reference[::3], np.array([0.05, -0.04, 0.06])  # at rest each point lies on its match
+    start = peers.as_pose(np.eye(3), shift)
+    for make in (peers.small_gicp_peer, peers.scipy_peer):
+        peer = make(reference)
+        pose, rounds = peer.align(source, start, 50)
+        np.testing.assert_allclose(pose, np.eye(4), atol=AT_REST)
+        assert 1 <= rounds <= 50
+        assert peer.distance(points, np.eye(4)) == pytest.approx(brute_hausdorff(points, reference), abs=SAME)
+        assert make(reference).align(source, start, 1)[1] == 1

@@ -53,7 +53,7 @@ def test_mean_and_std_must_be_finite_and_std_positive(mean, std):
     ("lower", "upper"), [(2.0, 3.0), (-3.0, 0.5), (1.0, 1.0), (np.nan, 2.0), (0.0, np.nan), (3.0, -3.0)]
 )
 def test_bounds_must_hold_the_mean_and_an_interval(lower, upper):
-    with pytest.raises(SettingError, match=r"parameter leaf_width: expected lower <= mean <= upper, got"):
+    with pytest.raises(SettingError, match=r"parameter leaf_width: expected lower <= mean <= upper and lower < upper"):
         Parameter("leaf_width", "cm", mean=1.0, std=1.0, lower=lower, upper=upper)
 
 

@@ -131,7 +131,7 @@ WIDTH = '[parameters.leaf_width]\nunit = "cm"\nmean = 6.0\nstd = 2.0\nlower = 0.
         (
             WIDTH,
             WIDTH.replace("lower = 0.3", "lower = 7.0").replace("[4.0, 8.0]", "[7.0, 8.0]"),
-            r"parameter leaf_width: expected lower <= mean <= upper, got 7 <= 6 <= inf",
+            r"parameter leaf_width: expected lower <= mean <= upper and lower < upper, got 7 <= 6 <= inf",
         ),
         (
             WIDTH,

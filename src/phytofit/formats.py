@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 from uuid import uuid4
 
 import laspy
-import lazrs  # type: ignore[import-untyped]
+import lazrs
 import numpy as np
 import pandas as pd
 import pypcd4.pypcd4

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phytofit.distances import Distance, Reference, hausdorff
-from phytofit.kernels.icp import icp, transform
+from phytofit.errors import SettingError
+from phytofit.kernels.icp import MAX_MEMORY, icp, transform
 from phytofit.models import Phytomer, SurfaceSampler
 from phytofit.models.organs import PopulationSurfaces
 
@@ -85,6 +86,8 @@ class PaperObjective:
         seed: int = 0,
         executor: Executor | None = None,
     ) -> None:
+        if not 0 <= memory <= MAX_MEMORY:
+            raise SettingError(f"memory: expected 0 to {MAX_MEMORY}, got {memory}")
         self._model = model
         self._reference = reference
         self._starts = list(starts)

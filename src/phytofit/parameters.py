@@ -32,7 +32,7 @@ class Parameter:
             )
         if not self.lower <= self.mean <= self.upper or self.lower == self.upper:
             raise SettingError(
-                f"parameter {self.name}: expected lower <= mean <= upper, "
+                f"parameter {self.name}: expected lower <= mean <= upper and lower < upper, "
                 f"got {self.lower:g} <= {self.mean:g} <= {self.upper:g}"
             )
 

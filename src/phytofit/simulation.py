@@ -47,7 +47,12 @@ def simulate(
     removed; `outlier_share` of the points that are left is added.
     """
     species = load_species() if species is None else species
-    for name, value, low in (("points", n_points, 1), ("noise", noise_cm, 0), ("spheres", n_spheres, 0)):
+    for name, value, low in (
+        ("points", n_points, 1),
+        ("noise", noise_cm, 0),
+        ("spheres", n_spheres, 0),
+        ("seed", seed, 0),
+    ):
         if not (np.isfinite(value) and value >= low):
             raise SettingError(f"{name}: expected a number of {low} or more, got {value:g}")
     if not (np.isfinite(sphere_diameter_cm) and sphere_diameter_cm > 0):

@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,6 @@ from numba.core import config
 __all__ = ["kernel"]
 
 F = TypeVar("F", bound=Callable[..., Any])
-KEPT_VERSIONS = 4  # of compiled code, one a version of the sources
 
 
 def _cache_folder() -> str | None:
@@ -27,18 +25,13 @@ def _cache_folder() -> str | None:
     for source in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(source.read_bytes())
     name = f"kernels-{digest.hexdigest()[:16]}"
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-    for root in (home / "phytofit", Path(tempfile.gettempdir()) / f"phytofit-{os.environ.get('USER', 'user')}"):
-        try:
-            (root / name).mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=root / name):
-                pass
-        except OSError:
-            continue
-        for old in sorted(root.glob("kernels-*"), key=lambda folder: folder.stat().st_mtime)[:-KEPT_VERSIONS]:
-            shutil.rmtree(old, ignore_errors=True)
-        return str(root / name)
-    return None
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "phytofit" / name
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return str(folder)
+    except OSError:
+        return None
 
 
 CACHE_FOLDER = _cache_folder()

@@ -81,6 +81,8 @@ class CrossEntropy:
         self.mean: FloatArray = np.array(space.mean if mean is None else mean, float)
         if self.mean.shape != (len(space),):
             raise SettingError(f"mean: expected {len(space)} numbers, got shape {self.mean.shape}")
+        if not np.all((self.mean >= space.lower) & (self.mean <= space.upper)):  # false for NaN too
+            raise SettingError(f"mean: expected numbers within the bounds of the space, got {self.mean.tolist()}")
         self.cov: FloatArray = np.diag(space.std**2)
         self.history: list[Generation] = []
         self._noise = covariance_noise * space.std**2  # diagonal of Z_0
@@ -112,6 +114,8 @@ class CrossEntropy:
     def tell(self, xs: FloatArray, errors: ArrayLike) -> Generation:
         """Take the errors (n_samples,) of the candidates xs and refit the distribution, Algorithm 1, steps 3 to 5."""
         errors = np.asarray(errors, float)
+        if self.done:
+            raise SettingError(f"tell: all {self.n_generations} generations have been told")
         if xs.shape != (self.n_samples, len(self.space)) or errors.shape != (self.n_samples,):
             raise SettingError(
                 f"tell: expected xs ({self.n_samples}, {len(self.space)}) and errors ({self.n_samples},), "

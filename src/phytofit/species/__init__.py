@@ -8,13 +8,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from phytofit.errors import SettingError, SpeciesError
 from phytofit.models.phytomer import Phytomer
 from phytofit.parameters import Parameter, ParameterSpace
 
 __all__ = ["Species", "load_species", "species_names"]
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # no text, no true or false
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class Species:
 
 class _Constants(BaseModel):
     model_config = ConfigDict(extra="forbid")
-    n_pieces: Annotated[int, Field(ge=2, le=1000)] = 30
+    n_pieces: Annotated[int, Field(strict=True, ge=2, le=1000)] = 30
     widest_share: Annotated[float, Field(ge=0, lt=1)] = 0.5
     slow_share: Annotated[float, Field(ge=0, le=1)] = 0.2
     concavity: Annotated[float, Field(ge=1, le=3)] = 2.0
@@ -47,11 +49,11 @@ class _Constants(BaseModel):
 class _Parameter(BaseModel):
     model_config = ConfigDict(extra="forbid")
     unit: str
-    mean: FiniteFloat
-    std: Annotated[FiniteFloat, Field(gt=0)]
-    lower: FiniteFloat | None = None
-    upper: FiniteFloat | None = None
-    range: tuple[FiniteFloat, FiniteFloat]
+    mean: Number
+    std: Annotated[Number, Field(gt=0)]
+    lower: Number | None = None
+    upper: Number | None = None
+    range: tuple[Number, Number]
 
 
 class _File(BaseModel):
@@ -95,7 +97,7 @@ def _folder() -> "resources.abc.Traversable":
 def _read(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise SpeciesError(
             f"{path}: can't be read as a species file ({reason}); "
