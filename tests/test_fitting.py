@@ -111,6 +111,7 @@ def test_up_decides_the_direction(made, up):
     assert sign * told.pose[:3, 2] @ made.pose[:3, 2] > 0.9
     leaf_angle = told.parameters["leaf_angle"]
     assert leaf_angle < 90.0 if up == "known" else leaf_angle > 90.0
+    assert any("is the stated up right?" in flag for flag in told.flags) == (up == "upside down")
 
 
 def test_a_straight_level_leaf_is_flagged_since_up_and_down_look_alike():
@@ -178,7 +179,7 @@ def test_notes_say_what_was_left_out():
         ({"up": "w"}, SettingError, "up: expected one of x, y, z"),
         ({"up": [0, 0, 0]}, SettingError, "up: expected three numbers"),
         ({"species": "triffid"}, SpeciesError, "triffid"),
-        ({"distance": "labels"}, SettingError, "the cloud has no labels"),
+        ({"distance": "labels"}, CloudError, "the cloud has no labels"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(made, settings, error, text):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from phytofit import DISTANCES, PaperObjective, Reference, SettingError, SurfaceSampler, load_species, objectives
+from phytofit import DISTANCES, CloudError, PaperObjective, Reference, SurfaceSampler, load_species, objectives
 from phytofit.distances import chamfer, labelled_hausdorff, quantile_hausdorff
 
 FLOAT32_CM = 2e-4  # clouds are float32 about 60 cm from the origin in the kernels
@@ -174,5 +174,5 @@ def test_labelled_hausdorff_with_one_organ_missing(scene):
 
 def test_labels_are_needed_for_the_labelled_distance(scene):
     _, points, _, _ = scene
-    with pytest.raises(SettingError, match="the cloud has no labels"):
+    with pytest.raises(CloudError, match="the cloud has no labels"):
         labelled_hausdorff(Reference.of(points))

@@ -47,7 +47,7 @@ OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the res
 
 @app.command("fit")
 def fit_command(
-    clouds: Annotated[list[Path], typer.Argument(help="Point clouds: PLY, PCD, LAS/LAZ, XYZ, TXT, CSV, PTS.")],
+    clouds: Annotated[list[Path], typer.Argument(help="Point clouds: PLY, PCD, LAS/LAZ, XYZ, TXT, CSV, PTS, ASC.")],
     units: Annotated[
         str | None, typer.Option("--units", "-u", help="Unit of the coordinates: cm, mm, m; none: relative lengths.")
     ] = None,
@@ -233,8 +233,7 @@ def _print_fit(result: Fit, name: str, where: Path) -> None:
     for column in ("organ", "trait", "value", "unit"):
         table.add_column(column, justify="right" if column == "value" else "left")
     for trait in result.traits:
-        unit = trait.unit.replace("cm", "rel") if result.relative else trait.unit
-        table.add_row(trait.organ, trait.name, f"{trait.value:.2f}", unit)
+        table.add_row(trait.organ, trait.name, f"{trait.value:.2f}", trait.unit)
     out.print(table)
     _print_remarks(result)
     error = f"{result.error:.2f} {'relative' if result.relative else 'cm'}"

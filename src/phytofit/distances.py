@@ -1,7 +1,7 @@
 """Distances from a generated cloud to the reference: the paper's Hausdorff distance and what may take its place.
 
 A new distance is a function of a :class:`Reference` that returns the function to be called for every candidate; add it
-to `DISTANCES` under its name, and ``fit(..., distance=name)`` and ``phytofit fit --distance name`` know it.
+to `DISTANCES` under its name, and ``fit(..., distance=name)`` knows it (the command too, if it is added here).
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from phytofit.errors import SettingError
+from phytofit.errors import CloudError
 from phytofit.kernels.distance import hausdorff_within
 from phytofit.kernels.nearest import Bins, NearestGrid, bin_points, make_bins, nearest_distances, nearest_grid
 
@@ -91,10 +91,10 @@ def chamfer(reference: Reference) -> Distance:
 def labelled_hausdorff(reference: Reference, mismatch_cm: float = 2.0) -> Distance:
     """Hausdorff distance in which a point counts as `mismatch_cm` further from points of another organ (section VI).
 
-    Points of unknown organ match any.  Raises SettingError where the reference has no labels.
+    Points of unknown organ match any.  Raises CloudError where the reference has no labels.
     """
     if reference.organ is None or not np.any(reference.organ >= 0):
-        raise SettingError(
+        raise CloudError(
             "distance labels: the cloud has no labels; expected a property that tells stem (1) from leaf (2..), "
             "or another distance"
         )

@@ -18,7 +18,7 @@ from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parameters import ParameterSpace
 from phytofit.pose import StartPose, start_poses
 from phytofit.species import Species, load_species
-from phytofit.traits import CHORD_CM, Trait, measure
+from phytofit.traits import Trait, measure
 
 __all__ = ["Fit", "fit", "minimise", "parse_up"]
 
@@ -26,6 +26,7 @@ FloatArray = NDArray[np.float64]
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 PLAUSIBLE_LEAD = 4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
+UP_DOUBTFUL = "the leaf leaves the stem downwards or bends up: is the stated up right?"
 UP_UNKNOWN = "up and down can't be told apart by this leaf: the more plausible is given; state up if it is known"
 
 
@@ -38,7 +39,8 @@ class Fit:
     to the cloud's, cm; ``error`` is the distance there, cm; ``registration`` tells how ICP ended (in the start pose's
     frame).  ``reference`` (m, 3) are the points that were fitted, in the cloud's frame, cm.  ``flags`` are remarks on
     the result in plain words, ``notes`` on what was done to the cloud.  ``relative`` says that the cloud had no unit:
-    lengths are then relative to each other only.  ``settings`` repeat the run.
+    lengths are then relative to each other only, and ``scale`` of them make a cm of the prior (1 otherwise); `x`,
+    `history` and `registration` are in the prior's cm.  ``method`` and ``settings`` repeat the run.
     """
 
     species: Species
@@ -75,9 +77,11 @@ class Fit:
 
     @property
     def traits(self) -> list[Trait]:
-        """The traits, measured on the fitted organs."""
-        chord = np.inf if self.relative else CHORD_CM
-        return measure(self.organs, chord_cm=chord, method=self.method, flags=self.flags)
+        """The traits, measured on the fitted organs; lengths in "rel" in place of "cm" where the cloud had no unit."""
+        if not self.relative:
+            return measure(self.organs, method=self.method, flags=self.flags)
+        traits = measure(self.organs, chord_cm=np.inf, method=self.method, flags=self.flags)
+        return [replace(trait, unit=trait.unit.replace("cm", "rel")) for trait in traits]
 
     @property
     def elite_std(self) -> dict[str, float]:
@@ -149,7 +153,10 @@ def fit(
             raise SettingError(f"{name}: expected {least} or more, got {value}")
     direction = parse_up(up)
     species = species if isinstance(species, Species) else load_species(os.fspath(species))
-    cloud = cloud if isinstance(cloud, PointCloud) else from_points(cloud, units)
+    if not isinstance(cloud, PointCloud):
+        cloud = from_points(cloud, units)
+    elif units not in (None, cloud.unit):
+        raise SettingError(f"units: {cloud.name} was read in {cloud.unit}, got {units!r}; leave units out")
     if not stem_above:
         species = species.without("stem_length_above")
     search = partial(
@@ -239,8 +246,9 @@ def minimise(
 def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
     """The result or its twin that is upside down: the same organs, so that no cloud can tell which is right.
 
-    Where `up` (3,) is not known, the one counts whose leaf is the more plausible by the prior: leaves leave the stem
-    upwards and bend down.  If neither is clearly so, a flag says it.
+    A stated `up` (3,) decides, and a flag says where the other is clearly more plausible.  Where up is not known, the
+    one counts whose leaf is the more plausible by the prior (leaves leave the stem upwards and bend down), and a flag
+    says where neither is clearly so.
     """
     space = result.species.space
     if "stem_length_above" not in space.names:
@@ -257,12 +265,17 @@ def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
             for g in result.history
         ),
     )
-    if up is not None:
-        return result if result.pose[:3, 2] @ up >= 0.0 else twin
     shape = [space.index(name) for name in ("leaf_angle", "leaf_rotate_angle")]
     surprise, surprise_of_twin = (
         float(np.sum(((it.x[shape] - space.mean[shape]) / space.std[shape]) ** 2)) for it in (result, twin)
     )
+    if up is not None:
+        told, doubt = (
+            (result, surprise - surprise_of_twin)
+            if result.pose[:3, 2] @ up >= 0.0
+            else (twin, surprise_of_twin - surprise)
+        )
+        return replace(told, flags=(*told.flags, UP_DOUBTFUL)) if doubt > PLAUSIBLE_LEAD else told
     better = twin if surprise_of_twin < surprise else result
     if abs(surprise - surprise_of_twin) < PLAUSIBLE_LEAD:
         return replace(better, flags=(*better.flags, UP_UNKNOWN))

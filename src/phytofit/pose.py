@@ -1,7 +1,7 @@
 """The start pose: where the stem stands in the cloud, which way is up, and on which side the leaf is.
 
-ICP is only local, so the paper's authors rotate each cloud by hand to the model's orientation.  Here the cloud may lie
-in any orientation.  Everything is computed from distances and inner products of the points, taken in the order in
+ICP is only local: the model must begin near where it belongs.  Here the cloud may lie in any orientation, and nobody
+turns it by hand.  Everything is computed from distances and inner products of the points, taken in the order in
 which they are stored: a rotated copy of a cloud gets the rotated pose.
 """
 
@@ -21,9 +21,7 @@ N_LINES = 2  # different lines that are handed on
 LEAST_SCORE = 0.3  # cm; a sphere or a wall gets 0.2 by chance, a phytomer with little left of its stem 0.4
 LEAST_SHARE = 0.6  # of the best line's score: a line that looks less like a stem is not handed on
 LEAST_ROUNDNESS = 0.3  # thin over wide of a section: a blade in 0.5 cm of noise reaches about 0.4, a stem 0.7 to 1
-MAX_AROUND = (
-    1.5  # points close around a stem, times those on it: a leaf.s base gives up to about 1, evenly spread noise 3
-)
+MAX_AROUND = 1.5  # points close around a stem over those on it: a leaf's base gives up to about 1, plain noise 3
 MAX_SLOPE = 2.0  # of a leaf's base, rise over run, when it is followed into the stem
 MAX_TILT_COSINE = 0.34  # with `up` given, a stem leans by less than 70 degrees
 

@@ -73,13 +73,14 @@ def write_text(path: Path, text: str) -> None:
         raise OutputError(f"{path}: can't be written ({error.strerror})") from None
 
 
-def save_fit(result: Fit, cloud: PointCloud, folder: Path, name: str | None = None) -> Path:
+def save_fit(result: Fit, cloud: PointCloud, folder: str | Path, name: str | None = None) -> Path:
     """Write ``folder/name/``: fit.json, traits.csv, model.ply, fit.png and convergence.png; all of them or none.
 
     A folder of that name from an earlier run is replaced.  model.ply is in the input's unit and frame.
     """
     name = name or cloud.name
-    target = prepare_folder(folder) / name
+    folder = prepare_folder(Path(folder))
+    target = folder / name
     part = Path(tempfile.mkdtemp(prefix=f".{name}.part-", dir=folder))
     try:
         part.chmod(0o755)
@@ -119,6 +120,10 @@ def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
             "unit": cloud.unit,
         },
         "species": result.species.name,
+        "prior": {
+            p.name: {"mean": p.mean, "std": p.std, "lower": _finite(p.lower), "upper": _finite(p.upper), "unit": p.unit}
+            for p in space.parameters
+        },
         "model": type(result.species.model).__name__,
         "method": result.method,
         "status": result.status.value,
@@ -152,8 +157,12 @@ def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
     }
 
 
+def _finite(bound: float) -> float | None:
+    return bound if np.isfinite(bound) else None
+
+
 def _unit(unit: str, result: Fit) -> str:
-    return "relative" if result.relative and unit == "cm" else unit
+    return "rel" if result.relative and unit == "cm" else unit
 
 
 def _hash(cloud: PointCloud) -> str:
