@@ -1,6 +1,5 @@
 """The examples run as they stand, with warnings as errors, and what they print makes sense."""
 
-import importlib.util
 import json
 import os
 import re
@@ -104,7 +103,6 @@ def test_own_species(tmp_path):
     assert_near(printed, "leaf_length", "stem_diameter")
 
 
-@pytest.mark.skipif(importlib.util.find_spec("cmaes") is None, reason="needs the package cmaes")
 def test_own_optimiser(tmp_path):
     printed = run(5, temporary=tmp_path)
     first, best = re.search(rf"generation 1: {NUMBER} cm; best of all 8: {NUMBER} cm", printed).groups()
