@@ -22,7 +22,7 @@ def scene():
     points, organ = SurfaceSampler(N_POINTS, 5).draw(organs)
     random = np.random.default_rng(1)
     points = points + random.normal(0.0, 0.3, points.shape) - organs[1].axis[0]
-    xs = truth + 0.3 * species.space.std * random.standard_normal((60, 7))
+    xs = truth + 0.3 * species.space.std[:7] * random.standard_normal((60, 7))
     return species, points, organ, np.maximum(xs, 0.5)
 
 

@@ -44,7 +44,7 @@ def angles_of(axis):
 @pytest.mark.parametrize("concavity", [1.0, 1.7, 2.0, 3.0])
 @pytest.mark.parametrize("n_pieces", [4, 30, 31, 60])
 def test_width_is_widest_at_the_base_and_none_at_the_tip(concavity, n_pieces):
-    width = Phytomer(n_pieces=n_pieces, concavity=concavity).width_profile()
+    width = Phytomer(n_pieces=n_pieces, concavity=concavity).width_profile()[0]
     i = np.arange(n_pieces + 1)
     assert width.shape == (n_pieces + 1,)
     np.testing.assert_allclose(width[i <= n_pieces / 2], 1.0, rtol=EXACT)  # w_0 = w_max, up to r = 0
@@ -58,16 +58,16 @@ def test_width_at_a_node_is_that_of_the_equation():
     """Node 24 of 30: r = (24 - 15) / (30 - 15) = 0.6."""
     k = 2.5
     expected = (k + math.log(1 - 0.6 + math.exp(-k))) / (k + math.log(1 + math.exp(-k)))
-    assert Phytomer(concavity=k).width_profile()[24] == pytest.approx(expected, rel=EXACT)
+    assert Phytomer(concavity=k).width_profile()[0, 24] == pytest.approx(expected, rel=EXACT)
 
 
 def test_a_higher_k_keeps_the_leaf_wide_for_longer():
-    low, high = (Phytomer(concavity=k).width_profile()[16:-1] for k in (1.0, 3.0))
+    low, high = (Phytomer(concavity=k).width_profile()[0, 16:-1] for k in (1.0, 3.0))
     assert np.all(high > low)
 
 
 def test_the_widest_part_may_end_at_the_base():
-    width = Phytomer(widest_share=0.0, n_pieces=10).width_profile()
+    width = Phytomer(widest_share=0.0, n_pieces=10).width_profile()[0]
     assert width[0] == pytest.approx(1.0, rel=EXACT)
     assert np.all(np.diff(width) < 0)
 
@@ -112,7 +112,7 @@ def test_areas(xs):
     diameter, below, _, length, width, _, above = xs[0]
     stem, leaf = grow(xs)
     assert stem.area == pytest.approx(math.pi * diameter * (below + above), rel=1e-9)
-    share = Phytomer().width_profile()
+    share = Phytomer().width_profile()[0]
     trapezoids = sum(0.5 * (share[i] + share[i + 1]) for i in range(30)) / 30
     assert leaf.area == pytest.approx(length * width * trapezoids, rel=1e-9)
 

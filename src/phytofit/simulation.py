@@ -61,7 +61,9 @@ def simulate(
         raise SettingError(f"outliers: expected a share from 0 to below 1, got {outlier_share:g}")
     random = np.random.default_rng(seed)
     space = species.space
-    x = random.uniform(species.ranges[:, 0], species.ranges[:, 1])
+    low, high = species.ranges.T
+    x = low.copy()
+    x[low < high] = random.uniform(low[low < high], high[low < high])
     for name, value in (fixed or {}).items():
         i = space.index(name)
         if not space.lower[i] <= value <= space.upper[i]:
@@ -71,7 +73,7 @@ def simulate(
             )
         x[i] = value
     organs: tuple[Organ, ...] = tuple(o.row(0) for o in species.model.organs(x))
-    points, organ = SurfaceSampler(n_points, int(random.integers(2**31))).draw(organs)
+    points, organ = SurfaceSampler(n_points, int(random.integers(2**31)), even=False).draw(organs)
     labels = organ.astype(np.int64) + 1
     shuffle = random.permutation(n_points)  # a sensor's points come in no order of the model's
     points, labels = points[shuffle], labels[shuffle]

@@ -80,10 +80,13 @@ class SurfaceSampler:
 
     The same `seed` gives every plant the same numbers (a scrambled Halton sequence: uniform, and more even than
     independent draws), so equal organs give equal points and a small change of the organs moves each point a little.
+    With ``even=False`` the draws are independent, as those of a sensor.
     """
 
-    def __init__(self, n_points: int, seed: int) -> None:
-        numbers = qmc.Halton(d=2, scramble=True, rng=np.random.default_rng(seed)).random(n_points)
+    def __init__(self, n_points: int, seed: int, *, even: bool = True) -> None:
+        random = np.random.default_rng(seed)
+        halton = qmc.Halton(d=2, scramble=True, rng=random)
+        numbers = halton.random(n_points) if even else random.random((n_points, 2))
         numbers = numbers[np.lexsort((numbers[:, 1], numbers[:, 0]))]
         self.n_points = n_points
         self._along = np.ascontiguousarray(numbers[:, 0])

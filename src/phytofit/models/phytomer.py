@@ -1,4 +1,4 @@
-"""The phytomer of section IV-B: a straight stem piece and one leaf, six parameters of Eq. (1) and one more."""
+"""The phytomer of section IV-B: a straight stem piece and one leaf, six parameters of Eq. (1) and some more."""
 
 from dataclasses import dataclass
 
@@ -16,12 +16,29 @@ FloatArray = NDArray[np.float64]
 class Phytomer:
     """G(X) of section IV-B, up to the sampling of points: parameters to organs, for a whole population at once.
 
-    The model's frame: the stem rises along +z from its foot at the origin; the leaf lies in the x-z plane, starts at
-    the stem's axis at height X2 and leans towards +x; its blade is level across, along y.
+    The model's frame: the stem rises along +z from its foot at the origin; the leaf starts at the stem's axis at
+    height X2, in the x-z plane, and leans towards +x; its blade is level across, along y.
 
     ``n_pieces`` midrib segments, of which the last ``slow_share`` (the paper's 20 %) bend half as much;
     ``widest_share`` n_pieces is the paper's i_max; ``concavity`` is k of Eq. (2), 1 to 3.  The bend is X6 per thirtieth
     of the leaf, so another `n_pieces` gives the same leaf, more or less finely.
+
+    What follows Eq. (1) is not the paper's.  A parameter that is left out has the value that gives the paper's model:
+    no stem above the leaf, a leaf that starts at the stem's axis and stays in one plane, and Eq. (2) as it is.
+
+    ====================== ===== =================================================================================
+    stem_length_above      cm    of the stem above the height at which the leaf starts
+    collar_offset          share of the stem's radius, at which the leaf starts; 1 is the stem's surface
+    leaf_bow               deg   that the middle of the midrib points lower than by an even bend
+    leaf_wave              deg   that a quarter of the midrib points lower, three quarters higher, than by an even bend
+    leaf_side_bend         deg   that the midrib turns sideways, from base to tip
+    leaf_side_bow          deg   that its middle is turned more than by an even side bend
+    leaf_roll              deg   of the blade about the midrib, at the base
+    leaf_twist             deg   of the blade about the midrib, from base to tip
+    leaf_base_width        share of the widest, at the base
+    leaf_widest_at         share of the midrib, from its start; ``widest_share``
+    leaf_taper             -     ``concavity``
+    ====================== ===== =================================================================================
     """
 
     n_pieces: int = 30
@@ -29,7 +46,7 @@ class Phytomer:
     slow_share: float = 0.2
     concavity: float = 2.0
 
-    PARAMETERS = (  # Eq. (1), in its order; the last is not the paper's: 0 without it
+    PARAMETERS = (  # Eq. (1), in its order; then what is not the paper's
         "stem_diameter",
         "stem_length",
         "leaf_angle",
@@ -37,18 +54,42 @@ class Phytomer:
         "leaf_width",
         "leaf_rotate_angle",
         "stem_length_above",
+        "collar_offset",
+        "leaf_bow",
+        "leaf_wave",
+        "leaf_side_bend",
+        "leaf_side_bow",
+        "leaf_roll",
+        "leaf_twist",
+        "leaf_base_width",
+        "leaf_widest_at",
+        "leaf_taper",
     )
-    UNITS = ("cm", "cm", "deg", "cm", "cm", "deg", "cm")
+    UNITS = ("cm", "cm", "deg", "cm", "cm", "deg", "cm", "share", *["deg"] * 6, "share", "share", "1")
 
-    def width_profile(self) -> FloatArray:
-        """Width at the nodes 0 .. n_pieces as a share of the widest, Eq. (2)."""
-        k = self.concavity
+    @property
+    def neutral(self) -> FloatArray:
+        """Values (k,) of the parameters; those after the sixth give the paper's model."""
+        return np.array([*[np.nan] * 6, *[0.0] * 8, 1.0, self.widest_share, self.concavity])
+
+    def width_profile(
+        self, base: FloatArray | None = None, widest: FloatArray | None = None, taper: FloatArray | None = None
+    ) -> FloatArray:
+        """Width at the nodes 0 .. n_pieces as a share of the widest, Eq. (2); (n, n_pieces + 1) of (n,) parameters.
+
+        With a `base` narrower than the widest, the width rises to it as a quarter of a sine.
+        """
+        base = np.ones(1) if base is None else base
+        widest = np.full(1, self.widest_share) if widest is None else widest
+        k = (np.full(1, self.concavity) if taper is None else taper)[:, np.newaxis]
         i = np.arange(self.n_pieces + 1)
-        i_max = self.widest_share * self.n_pieces
+        i_max = widest[:, np.newaxis] * self.n_pieces
         r = np.clip((i - i_max) / (self.n_pieces - i_max), 0.0, 1.0)
         profile: FloatArray = (k + np.log(1.0 - r + np.exp(-k))) / (k + np.log(1.0 + np.exp(-k)))  # Eq. (2)
-        profile[-1] = 0.0  # exactly: k + log(e^-k)
-        return profile
+        profile[:, -1] = 0.0  # exactly: k + log(e^-k)
+        rise = np.sin(0.5 * np.pi * np.clip(i / np.maximum(i_max, 1e-9), 0.0, 1.0))
+        narrowed: FloatArray = profile * (1.0 - (1.0 - base[:, np.newaxis]) * (1.0 - rise))
+        return narrowed
 
     def midrib_angles(self, leaf_angle: FloatArray, leaf_rotate_angle: FloatArray) -> FloatArray:
         """Angle from the stem's axis of every midrib segment, (n, n_pieces) degrees, of (n,) parameters."""
@@ -60,15 +101,17 @@ class Phytomer:
         return angles
 
     def organs(self, xs: ArrayLike) -> tuple[Organ, Organ]:
-        """Stem and leaf of a population: xs (n, 6) as Eq. (1), or (n, 7) with the stem's length above the leaf.
+        """Stem and leaf of a population: xs (n, 6) as Eq. (1), or with more of `PARAMETERS`.
 
         Every array of the organs has a leading n; lengths are cm, angles degrees.
         """
         xs = np.atleast_2d(np.asarray(xs, float))
-        diameter, below, leaf_angle, leaf_length, leaf_width, rotate = xs.T[:6]
-        above = xs[:, 6] if xs.shape[1] > 6 else np.zeros(len(xs))
+        n, given = xs.shape
+        rest = np.broadcast_to(self.neutral[given:], (n, len(self.PARAMETERS) - given))
+        diameter, below, leaf_angle, leaf_length, leaf_width, rotate, above, offset, *shape = np.hstack([xs, rest]).T
+        bow, wave, side_bend, side_bow, roll, twist, *profile = shape
 
-        stem_axis = np.zeros((len(xs), 2, 3))
+        stem_axis = np.zeros((n, 2, 3))
         stem_axis[:, 1, 2] = below + above
         stem = Organ(
             STEM,
@@ -77,30 +120,47 @@ class Phytomer:
             np.repeat(0.5 * diameter[:, np.newaxis], 2, axis=1),
         )
 
-        angle = np.deg2rad(self.midrib_angles(leaf_angle, rotate))
-        piece = (leaf_length / self.n_pieces)[:, np.newaxis]
-        midrib = np.zeros((len(xs), self.n_pieces + 1, 3))
-        midrib[:, 1:, 0] = np.cumsum(piece * np.sin(angle), axis=1)
-        midrib[:, 1:, 2] = np.cumsum(piece * np.cos(angle), axis=1)
+        s = np.arange(self.n_pieces) / (self.n_pieces - 1)  # 0 at the first segment, 1 at the last
+        hump, swing = 4.0 * s * (1.0 - s), 10.392304845413264 * s * (1.0 - s) * (1.0 - 2.0 * s)  # of height 1
+        pitch = np.deg2rad(self.midrib_angles(leaf_angle, rotate) + np.outer(bow, hump) + np.outer(wave, swing))
+        yaw = np.deg2rad(np.outer(side_bend, s) + np.outer(side_bow, hump))
+        frame = _turned(pitch, yaw, np.deg2rad(roll[:, np.newaxis] + np.outer(twist, s)))
+        midrib = np.zeros((n, self.n_pieces + 1, 3))
+        midrib[:, 1:] = np.cumsum((leaf_length / self.n_pieces)[:, np.newaxis, np.newaxis] * frame[..., 0], axis=1)
         midrib[:, :, 2] += below[:, np.newaxis]
-        leaf = Organ(
-            LEAF,
-            midrib,
-            frames_along(midrib, np.array([0.0, 1.0, 0.0])),
-            0.5 * leaf_width[:, np.newaxis] * self.width_profile(),
-        )
+        midrib[:, :, 0] += (0.5 * diameter * offset)[:, np.newaxis]
+        leaf = Organ(LEAF, midrib, frame, 0.5 * leaf_width[:, np.newaxis] * self.width_profile(*profile))
         return stem, leaf
 
-    @staticmethod
-    def upside_down(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The other parameters x (7,) of the same organs, seen upside down: ``turn @ x + offset``.
+    @classmethod
+    def upside_down(cls, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The other parameters x (k,) of the same organs, seen upside down: ``turn @ x + offset``; k is 7 or more.
 
-        Returns turn (7, 7), offset (7,) and the pose (4, 4) from the other plant's frame to this one's.  Without what
+        Returns turn (k, k), offset (k,) and the pose (4, 4) from the other plant's frame to this one's.  Without what
         is known of leaves (they leave the stem upwards and bend down) no cloud can tell the two apart.
         """
-        turn = np.eye(7)[[0, 6, 2, 3, 4, 5, 1]]  # what was below the leaf is above it
-        turn[2, 2] = turn[5, 5] = -1.0
-        offset = np.array([0.0, 0.0, 180.0, 0.0, 0.0, 0.0, 0.0])
+        names = cls.PARAMETERS[: len(x)]
+        turn = np.eye(len(x))
+        turn[[1, 6]] = turn[[6, 1]]  # what was below the leaf is above it
+        for name in ("leaf_angle", "leaf_rotate_angle", "leaf_bow", "leaf_wave", "leaf_side_bend", "leaf_side_bow"):
+            if name in names:
+                turn[names.index(name), names.index(name)] = -1.0
+        offset = np.zeros(len(x))
+        offset[2] = 180.0
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[2, 3] = x[1] + x[6]
         return turn, offset, pose
+
+
+def _turned(pitch: FloatArray, yaw: FloatArray, roll: FloatArray) -> FloatArray:
+    """Frames (n, m, 3, 3), columns tangent, lateral, normal, of angles (n, m) from the stem's axis (+z) in the x-z
+    plane, then sideways out of that plane, then of the blade about its midrib."""
+    cp, sp, cy, sy, cr, sr = np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw), np.cos(roll), np.sin(roll)
+    zero = np.zeros_like(pitch)
+    ahead = np.stack([sp, zero, cp], axis=-1)
+    normal = np.stack([-cp, zero, sp], axis=-1)
+    across = np.array([0.0, 1.0, 0.0])
+    tangent = cy[..., np.newaxis] * ahead + sy[..., np.newaxis] * across
+    level = cy[..., np.newaxis] * across - sy[..., np.newaxis] * ahead
+    lateral = cr[..., np.newaxis] * level + sr[..., np.newaxis] * normal
+    return np.stack([tangent, lateral, cr[..., np.newaxis] * normal - sr[..., np.newaxis] * level], axis=-1)

@@ -31,11 +31,9 @@ class Species:
     space: ParameterSpace
     ranges: NDArray[np.float64]
 
-    def without(self, parameter: str) -> "Species":
-        """The species with its last parameter left out, if it is the one called `parameter`."""
-        if self.space.names[-1] != parameter:
-            return self
-        return replace(self, space=ParameterSpace(self.space.parameters[:-1]), ranges=self.ranges[:-1])
+    def leading(self, n: int) -> "Species":
+        """The species with the first `n` of its parameters only: 6 are the paper's."""
+        return replace(self, space=ParameterSpace(self.space.parameters[:n]), ranges=self.ranges[:n])
 
 
 class _Constants(BaseModel):
@@ -72,8 +70,8 @@ def species_names() -> list[str]:
 def load_species(species: str | Path = "sorghum") -> Species:
     """Read a species by name, or from a TOML file of the user's.
 
-    The parameters must be those of the model, in any order; the last of the phytomer's, ``stem_length_above``, may be
-    left out.  Raises SpeciesError, which names the file, the key, and what was expected.
+    The parameters must be those of the model, in any order; of the phytomer's, those after the sixth may be left out
+    from any one on.  Raises SpeciesError, which names the file, the key, and what was expected.
     """
     if str(species) in species_names():
         text, where = _folder().joinpath(f"{species}.toml").read_text(encoding="utf-8"), f"{species}.toml"
@@ -106,9 +104,10 @@ def _read(path: Path) -> str:
 
 
 def _assemble(file: _File, where: str) -> Species:
-    known, required = Phytomer.PARAMETERS, Phytomer.PARAMETERS[:6]
+    known = Phytomer.PARAMETERS
     unknown = sorted(set(file.parameters) - set(known))
-    missing = [name for name in required if name not in file.parameters]
+    given = max((known.index(name) for name in file.parameters if name in known), default=0)
+    missing = [name for name in known[: max(given, 6)] if name not in file.parameters]
     if unknown or missing:
         found = f"unknown {', '.join(unknown)}" if unknown else f"no {', '.join(missing)}"
         raise SpeciesError(f"{where}: parameters: {found}; the {file.model} has {', '.join(known)}")
