@@ -15,8 +15,9 @@ from phytofit.errors import SettingError
 from phytofit.kernels.icp import MAX_MEMORY, icp, transform
 from phytofit.models import Phytomer, SurfaceSampler
 from phytofit.models.organs import PopulationSurfaces
+from phytofit.optimize import CrossEntropy, Generation
 
-__all__ = ["PaperObjective", "Registration"]
+__all__ = ["PaperObjective", "Registration", "minimise"]
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -189,6 +190,20 @@ class PaperObjective:
         aligned[:3, :3] = r
         aligned[:3, 3] = t - r @ mean
         return Registration(aligned, float(np.sqrt(mse)), int(iterations), bool(converged))
+
+
+def minimise(
+    search: CrossEntropy,
+    objective: Callable[[FloatArray, int], FloatArray],
+    progress: Callable[[Generation], None] | None = None,
+) -> CrossEntropy:
+    """Run the search to its end on ``objective(xs (n, k), n_elite) -> errors (n,)`` and return it."""
+    while not search.done:
+        xs = search.ask()
+        generation = search.tell(xs, objective(xs, search.n_elite))
+        if progress is not None:
+            progress(generation)
+    return search
 
 
 def _poses_at(junction: FloatArray, starts: Sequence[FloatArray]) -> list[FloatArray]:

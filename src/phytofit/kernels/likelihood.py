@@ -1,0 +1,231 @@
+"""Density of points that lie on a phytomer's surface, with noise, and its derivatives."""
+
+from math import erf
+
+import numpy as np
+
+from phytofit.kernels.compiling import kernel
+
+__all__ = ["LEAF_COLUMNS", "STEM_COLUMNS", "log_density"]
+
+REACH = 5.5  # noise levels from a surface at which its density counts as none: e^-15 of the greatest
+LEAF_COLUMNS = 9  # of a leaf segment's change: translation (3), rotation (3), length, half widths at both ends
+STEM_COLUMNS = 8  # of the stem's: translation (3), rotation (3), length, radius
+ROOT_TWO = np.sqrt(2.0)
+ROOT_TWO_PI = np.sqrt(2.0 * np.pi)
+
+
+@kernel
+def _bessel(x):
+    """exp(-x) I0(x) and I1(x) / I0(x), x >= 0, to about 1e-7 (Abramowitz and Stegun, 9.8.1 to 9.8.4)."""
+    if x < 3.75:
+        t = (x / 3.75) ** 2
+        i0 = 1.0 + t * (
+            3.5156229 + t * (3.0899424 + t * (1.2067492 + t * (0.2659732 + t * (0.0360768 + t * 0.0045813))))
+        )
+        i1 = x * (
+            0.5
+            + t
+            * (0.87890594 + t * (0.51498869 + t * (0.15084934 + t * (0.02658733 + t * (0.00301532 + t * 0.00032411)))))
+        )
+        return np.exp(-x) * i0, i1 / i0
+    t = 3.75 / x
+    i0 = 0.39894228 + t * (
+        0.01328592
+        + t
+        * (
+            0.00225319
+            + t
+            * (
+                -0.00157565
+                + t * (0.00916281 + t * (-0.02057706 + t * (0.02635537 + t * (-0.01647633 + t * 0.00392377))))
+            )
+        )
+    )
+    i1 = 0.39894228 + t * (
+        -0.03988024
+        + t
+        * (
+            -0.00362018
+            + t
+            * (
+                0.00163801
+                + t * (-0.01031555 + t * (0.02282967 + t * (-0.02895312 + t * (0.01787654 - t * 0.00420059))))
+            )
+        )
+    )
+    return i0 / np.sqrt(x), i1 / i0
+
+
+@kernel
+def _normal(x, std):
+    z = x / std
+    return np.exp(-0.5 * z * z) / (ROOT_TWO_PI * std)
+
+
+@kernel
+def _between(low, high, std):
+    """Probability that a normal number of zero mean lies between two limits."""
+    return 0.5 * (erf(high / (ROOT_TWO * std)) - erf(low / (ROOT_TWO * std)))
+
+
+@kernel
+def log_density(
+    points, organ,
+    leaf_origin, leaf_frame, leaf_length, leaf_half, leaf_change, leaf_area_change,
+    stem_origin, stem_frame, stem_length, radius, stem_change,
+    noise, share, outlier_density,
+    log_p, scores,
+):  # fmt: skip
+    """Log density of points, each from the stem's surface, the leaf's, or an outlier, and its derivatives.
+
+    A point of an organ is uniform on its surface, displaced by isotropic normal noise.  For a flat patch its density
+    is a normal density across it times differences of error functions along and across; for a tube, a ring blurred by
+    noise (a Rice density: Bessel function I0) times such a difference along the axis.
+
+    Parameters
+    ----------
+    points : (n, 3)
+    organ : (n,) int8: 0 stem, 1 leaf; -1 unknown, may be of either
+    leaf_origin (m, 3), leaf_frame (m, 3, 3) columns tangent, lateral, normal, leaf_length (m,), leaf_half (m + 1,) :
+        the leaf's segments, and half widths at the nodes
+    stem_origin (3,), stem_frame (3, 3) columns tangent and two across, stem_length, radius : the stem
+    leaf_change (m, k, 9), leaf_area_change (k,), stem_change (k, 8) : change of a segment, in its own frame, of the
+        logarithm of the leaf's area, and of the stem, for a unit change of each of k parameters
+    noise : (3,) standard deviation: on the stem; on the leaf; and what its thickness adds to that across the blade
+    share : (3,) of the points: stem, leaf, outliers
+    outlier_density : of an outlier, per volume
+    log_p : (n,), filled with the log density
+    scores : (n, k + 5), filled with its derivatives by the k parameters, by the logarithms of the three noises, and by
+        the logits of the shares of stem and outliers (relative to the leaf's); or (0, 0): not wanted
+    """
+    n = points.shape[0]
+    m = leaf_origin.shape[0]
+    k = stem_change.shape[0]
+    wanted = scores.shape[0] > 0
+    stem_noise, leaf_noise, thickness = noise[0], noise[1], np.hypot(noise[1], noise[2])
+    thin = (leaf_noise / thickness) ** 2
+    reach = REACH * leaf_noise
+    depth = REACH * thickness
+    area = 0.0
+    for j in range(m):
+        area += leaf_length[j] * (leaf_half[j] + leaf_half[j + 1])
+    floor = share[2] * outlier_density
+    for i in range(n):
+        on_stem = 0.0
+        on_leaf = 0.0
+        if wanted:
+            for c in range(k + 5):
+                scores[i, c] = 0.0
+        if organ[i] != 1:
+            x, y, z = points[i, 0] - stem_origin[0], points[i, 1] - stem_origin[1], points[i, 2] - stem_origin[2]
+            u = stem_frame[0, 0] * x + stem_frame[1, 0] * y + stem_frame[2, 0] * z
+            v = stem_frame[0, 1] * x + stem_frame[1, 1] * y + stem_frame[2, 1] * z
+            w = stem_frame[0, 2] * x + stem_frame[1, 2] * y + stem_frame[2, 2] * z
+            rho = np.sqrt(v * v + w * w)
+            far = REACH * stem_noise
+            if u > -far and u < stem_length + far and rho < radius + far and rho > radius - far:
+                along = _between(u - stem_length, u, stem_noise)
+                square = stem_noise * stem_noise
+                bessel, ratio = _bessel(rho * radius / square)
+                gap = rho - radius
+                density = np.exp(-0.5 * gap * gap / square) * bessel / (2.0 * np.pi * square) * along / stem_length
+                on_stem = share[0] * density
+                if wanted and on_stem > 0.0:
+                    at_foot, at_top = _normal(u, stem_noise), _normal(u - stem_length, stem_noise)
+                    by_u = (at_foot - at_top) / along
+                    by_length = at_top / along - 1.0 / stem_length
+                    by_rho = (radius * ratio - rho) / square
+                    by_radius = (rho * ratio - radius) / square
+                    by_noise = (
+                        -2.0
+                        + (rho * rho + radius * radius - 2.0 * rho * radius * ratio) / square
+                        - (u * at_foot - (u - stem_length) * at_top) / along
+                    )
+                    by_v = by_rho * v / rho if rho > 0.0 else 0.0
+                    by_w = by_rho * w / rho if rho > 0.0 else 0.0
+                    for c in range(k):
+                        change = stem_change[c]
+                        du = -change[0] - (change[4] * w - change[5] * v)
+                        dv = -change[1] - (change[5] * u - change[3] * w)
+                        dw = -change[2] - (change[3] * v - change[4] * u)
+                        scores[i, c] = on_stem * (
+                            by_u * du + by_v * dv + by_w * dw + by_length * change[6] + by_radius * change[7]
+                        )
+                    scores[i, k] = on_stem * by_noise
+        if organ[i] != 0:
+            weight = share[1] / area
+            for j in range(m):
+                x, y, z = (
+                    points[i, 0] - leaf_origin[j, 0],
+                    points[i, 1] - leaf_origin[j, 1],
+                    points[i, 2] - leaf_origin[j, 2],
+                )
+                w = leaf_frame[j, 0, 2] * x + leaf_frame[j, 1, 2] * y + leaf_frame[j, 2, 2] * z
+                if w > depth or w < -depth:
+                    continue
+                u = leaf_frame[j, 0, 0] * x + leaf_frame[j, 1, 0] * y + leaf_frame[j, 2, 0] * z
+                length = leaf_length[j]
+                if u < -reach or u > length + reach:
+                    continue
+                v = leaf_frame[j, 0, 1] * x + leaf_frame[j, 1, 1] * y + leaf_frame[j, 2, 1] * z
+                slope = leaf_half[j + 1] - leaf_half[j]
+                if v > max(leaf_half[j], leaf_half[j + 1]) + reach or v < -max(leaf_half[j], leaf_half[j + 1]) - reach:
+                    continue
+                along = _between(u - length, u, leaf_noise)
+                if along <= 0.0:
+                    continue
+                # the half width is taken where the point comes from on average, given u
+                square = leaf_noise * leaf_noise
+                at_start, at_end = _normal(u, leaf_noise), _normal(u - length, leaf_noise)
+                pull = (at_start - at_end) / along
+                s = min(max((u + square * pull) / length, 0.0), 1.0)
+                half = leaf_half[j] + s * slope
+                across = _between(v - half, v + half, leaf_noise)
+                density = weight * _normal(w, thickness) * along * across
+                if density <= 0.0:
+                    continue
+                on_leaf += density
+                if wanted:
+                    at_left, at_right = _normal(v + half, leaf_noise), _normal(v - half, leaf_noise)
+                    by_u = pull
+                    by_v = (at_left - at_right) / across
+                    by_w = -w / (thickness * thickness)
+                    by_half = (at_left + at_right) / across
+                    by_length = at_end / along
+                    spread = (u * at_start - (u - length) * at_end) / along
+                    by_place = by_half * slope / length  # of the place where the half width is taken
+                    by_u += by_place * (1.0 - spread - square * pull * pull)
+                    by_length -= by_place * (((u - length) + square * pull) * at_end / along + s)
+                    by_thickness = w * w / (thickness * thickness) - 1.0
+                    by_noise = (
+                        thin * by_thickness
+                        - spread
+                        + by_place
+                        * (square * pull * (1.0 + spread) + (u * u * at_start - (u - length) ** 2 * at_end) / along)
+                        - ((v + half) * at_left - (v - half) * at_right) / across
+                    )
+                    for c in range(k):
+                        change = leaf_change[j, c]
+                        du = -change[0] - (change[4] * w - change[5] * v)
+                        dv = -change[1] - (change[5] * u - change[3] * w)
+                        dw = -change[2] - (change[3] * v - change[4] * u)
+                        scores[i, c] += density * (
+                            by_u * du
+                            + by_v * dv
+                            + by_w * dw
+                            + by_length * change[6]
+                            + by_half * ((1.0 - s) * change[7] + s * change[8])
+                        )
+                    scores[i, k + 1] += density * by_noise
+                    scores[i, k + 2] += density * (1.0 - thin) * by_thickness
+        p = floor + on_stem + on_leaf
+        log_p[i] = np.log(p)
+        if wanted:
+            for c in range(k):
+                scores[i, c] = (scores[i, c] - on_leaf * leaf_area_change[c]) / p
+            scores[i, k] /= p
+            scores[i, k + 1] /= p
+            scores[i, k + 2] /= p
+            scores[i, k + 3] = on_stem / p - share[0]
+            scores[i, k + 4] = floor / p - share[2]

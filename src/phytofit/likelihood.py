@@ -1,0 +1,284 @@
+"""The likelihood of a cloud under a phytomer's surface: each point of the stem, of the leaf, or an outlier."""
+
+import copy
+from collections.abc import Iterable
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from phytofit.kernels.likelihood import LEAF_COLUMNS, STEM_COLUMNS, log_density
+from phytofit.models import Organ, Phytomer
+from phytofit.parameters import ParameterSpace
+
+__all__ = ["CloudLikelihood", "Evaluation", "State"]
+
+FloatArray = NDArray[np.float64]
+N_EXTRA = 12  # entries of theta after the model's parameters, see State
+THICKNESS = -3  # its place in theta
+NO_THICKNESS_CM = 1e-6
+LEAST_NOISE_CM = 0.05  # a midrib of straight pieces lies up to 0.02 cm off a curved one
+LEAST_SEEN, SEEN_SPREAD = 0.3, 0.3  # of the midrib: bound, and the prior's spread below 1
+BLOCK = 500  # points that a thread takes at a time
+STEP = 1e-4  # of a prior's spread, for the derivatives of the organs
+NOISE_CM, NOISE_FACTOR = 0.3, 3.0  # of a surface's points: the prior's middle, and one spread of it
+SHARE_SPREAD = 2.5  # of the logits of the shares
+STEM_SHARE, OUTLIER_SHARE = 0.3, 0.03  # before a cloud is seen; the rest is the leaf's
+MOST_OUTLIERS = np.log(4.0)  # bound of logit_outlier
+
+
+@dataclass(frozen=True)
+class State:
+    """A phytomer in a cloud.
+
+    ``theta`` (k + 12,) are the model's k parameters, the share of the midrib that was seen, from its start (1 unless
+    the tip is missing), a turn (rotation vector, radians) and a shift (cm) of the pose, logarithms of the noise on
+    stem and leaf and of the leaf's thickness (cm), logits of the shares of stem and outliers (relative to the leaf's).
+    ``pose`` (4, 4) is the pose before it is turned about ``center`` (3,) and shifted.
+    """
+
+    theta: FloatArray
+    pose: FloatArray
+    center: FloatArray
+
+    @property
+    def n_parameters(self) -> int:
+        """k, of the model."""
+        return len(self.theta) - N_EXTRA
+
+    @property
+    def x(self) -> FloatArray:
+        """Parameters (k,) of the model."""
+        return self.theta[: self.n_parameters]
+
+    @property
+    def seen(self) -> float:
+        """Share of the midrib that was seen."""
+        return float(self.theta[self.n_parameters])
+
+    @property
+    def turn(self) -> FloatArray:
+        """Rotation vector (3,), radians."""
+        return self.theta[-11:-8]
+
+    @property
+    def shift(self) -> FloatArray:
+        """(3,) cm."""
+        return self.theta[-8:-5]
+
+    @property
+    def noise(self) -> FloatArray:
+        """(3,) cm: on the stem, on the leaf, and what its thickness adds to that across the blade."""
+        return np.exp(self.theta[-5:-2])
+
+    @property
+    def share(self) -> FloatArray:
+        """(3,) of the points: stem, leaf, outliers."""
+        share = np.exp(np.array([self.theta[-2], 0.0, self.theta[-1]]))
+        normed: FloatArray = share / share.sum()
+        return normed
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """``error``: minus the log posterior, nats; ``scores`` (n, k): derivatives of the points' log densities;
+    ``log_p`` (n,)."""
+
+    error: float
+    scores: FloatArray
+    log_p: FloatArray
+
+
+class CloudLikelihood:
+    """-log p(cloud | phytomer) - log p(phytomer), with derivatives.
+
+    A point is uniform by area on the stem (a tube) or the leaf (a strip), displaced by isotropic normal noise of the
+    organ's own level, or an outlier, uniform in the cloud's box.  Being a density, it needs no distance from model to
+    cloud: a model larger than its data spreads its points thin, and pays.  Noise and shares are parameters, and so is
+    the pose.
+
+    Parameters
+    ----------
+    space : prior of the model's parameters, normal, within bounds
+    points : (n, 3) cm
+    organ : (n,) 0 stem, 1 leaf, -1 unknown; None: all unknown
+    weights : (n,) of the points; None: all 1
+    thick : whether the leaf may have a thickness, which widens the noise across the blade
+    cut : whether the leaf's tip may be missing
+    """
+
+    def __init__(
+        self,
+        model: Phytomer,
+        space: ParameterSpace,
+        points: FloatArray,
+        *,
+        organ: NDArray[np.int8] | None = None,
+        weights: FloatArray | None = None,
+        thick: bool = False,
+        cut: bool = False,
+        executor: Executor | None = None,
+    ) -> None:
+        self.model = model
+        self.space = space
+        self.points = np.ascontiguousarray(points)
+        self.organ = np.full(len(points), -1, np.int8) if organ is None else organ
+        self.weights = weights
+        box = np.ptp(points, axis=0)
+        self._outlier_density = 1.0 / float(np.prod(box + 0.05 * box.max()))
+        self._executor = executor
+        inside = 1.0 - STEM_SHARE - OUTLIER_SHARE
+        shares = [np.log(STEM_SHARE / inside), np.log(OUTLIER_SHARE / inside)]
+        self.mean = np.array([*space.mean, 1.0, *[0.0] * 6, *[np.log(NOISE_CM)] * 3, *shares])
+        self.std = np.array([*space.std, SEEN_SPREAD, *[np.inf] * 6, *[np.log(NOISE_FACTOR)] * 3, *[SHARE_SPREAD] * 2])
+        self.precision = self.std**-2.0
+        self.lower = np.array(
+            [*space.lower, LEAST_SEEN, *[-np.inf] * 6, *[np.log(LEAST_NOISE_CM)] * 2, np.log(0.005), *[-9.0] * 2]
+        )
+        self.upper = np.array([*space.upper, 1.0, *[np.inf] * 6, *[np.log(5.0)] * 3, 5.0, MOST_OUTLIERS])
+        if not thick:
+            self.mean[THICKNESS] = self.lower[THICKNESS] = self.upper[THICKNESS] = np.log(NO_THICKNESS_CM)
+        if not cut:
+            self.lower[len(space)] = 1.0
+
+    def start(self, x: FloatArray, pose: FloatArray, noise_cm: float) -> State:
+        """A state with the parameters x (k,) in a pose (4, 4)."""
+        theta = self.mean.copy()
+        theta[: len(x)] = x
+        theta[-5:-3] = np.log(noise_cm)
+        center = pose[:3, :3] @ np.array([0.0, 0.0, x[1]]) + pose[:3, 3]
+        return State(theta, pose, center)
+
+    def extended(self, state: State) -> State:
+        """The state of a model with fewer parameters, with those that it lacks at the prior's mean."""
+        k = state.n_parameters
+        theta = np.concatenate([state.x, self.mean[k : len(self.space)], state.theta[k:]])
+        theta[THICKNESS] = max(theta[THICKNESS], self.mean[THICKNESS])
+        return State(theta, state.pose, state.center)
+
+    def at(self, points: FloatArray) -> "CloudLikelihood":
+        """The same likelihood, of points that have moved."""
+        moved = copy.copy(self)
+        moved.points = np.ascontiguousarray(points)
+        return moved
+
+    def with_theta(self, state: State, theta: FloatArray) -> State:
+        return State(theta, state.pose, state.center)
+
+    def pose_of(self, state: State) -> FloatArray:
+        """Pose (4, 4) from the model's frame to the cloud's."""
+        turn = Rotation.from_rotvec(state.turn).as_matrix()
+        pose = np.eye(4)
+        pose[:3, :3] = turn @ state.pose[:3, :3]
+        pose[:3, 3] = turn @ (state.pose[:3, 3] - state.center) + state.center + state.shift
+        return pose
+
+    def evaluate(self, state: State, *, derivatives: bool = True) -> Evaluation:
+        """The error and, if wanted, the scores (n, k + 12) of a state."""
+        k = len(self.space)
+        columns = np.repeat(state.theta[np.newaxis, : k + 1], 2 * k + 3 if derivatives else 1, axis=0)
+        steps = STEP * self.std[: k + 1]
+        if derivatives:
+            columns[1 : k + 2] += np.diag(steps)
+            columns[k + 2 :] -= np.diag(steps)
+        stem, leaf = self.model.organs(columns[:, :k])
+        length, half = _seen(leaf, columns[:, k])
+        pose = self.pose_of(state)
+        r = pose[:3, :3]
+        n_columns = k + 7 if derivatives else 0
+        leaf_change = np.zeros((leaf.frame.shape[1], n_columns, LEAF_COLUMNS))
+        stem_change = np.zeros((n_columns, STEM_COLUMNS))
+        area_change = np.zeros(n_columns)
+        if derivatives:
+            leaf_change[:, : k + 1] = _change(leaf, length, half, steps)
+            stem_change[: k + 1] = _change(stem, stem.segment_lengths, stem.half_width, steps)[0, :, :STEM_COLUMNS]
+            area = np.sum(length * (half[:, 1:] + half[:, :-1]), axis=1)
+            area_change[: k + 1] = np.diff(np.log(area[1:].reshape(2, k + 1)), axis=0)[0] / (-2.0 * steps)
+            centre_in_model = r.T @ (state.center + state.shift - pose[:3, 3])
+            turning = r.T @ _left_jacobian(state.turn)  # columns: axes of turning, in the model's frame
+            leaf_change[:, k + 1 :, :6] = _pose_change(leaf.axis[0, :-1], leaf.frame[0], turning, r.T, centre_in_model)
+            stem_change[k + 1 :, :6] = _pose_change(stem.axis[0, :1], stem.frame[0], turning, r.T, centre_in_model)[0]
+        n = len(self.points)
+        log_p = np.empty(n)
+        scores = np.empty((n if derivatives else 0, k + N_EXTRA))
+        arguments = (
+            leaf.axis[0, :-1] @ r.T + pose[:3, 3], r @ leaf.frame[0], length[0], half[0], leaf_change, area_change,
+            r @ stem.axis[0, 0] + pose[:3, 3], r @ stem.frame[0, 0], float(stem.segment_lengths[0, 0]),
+            float(stem.half_width[0, 0]), stem_change, state.noise, state.share, self._outlier_density,
+        )  # fmt: skip
+
+        def block(first: int) -> None:
+            part = slice(first, first + BLOCK)
+            log_density(self.points[part], self.organ[part], *arguments, log_p[part], scores[part])
+
+        firsts = range(0, n, BLOCK)
+        done: Iterable[None] = map(block, firsts) if self._executor is None else self._executor.map(block, firsts)
+        for _ in done:
+            pass
+        prior = 0.5 * float(np.sum((state.theta - self.mean) ** 2 * self.precision))
+        return Evaluation(prior - float(log_p.sum() if self.weights is None else self.weights @ log_p), scores, log_p)
+
+
+def _seen(leaf: Organ, share: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lengths (n, m) of the segments and half widths (n, m + 1) at their ends, of that `share` (n,) of each leaf that
+    was seen, from its base; what comes after has no length."""
+    n_pieces = leaf.frame.shape[1]
+    part = np.clip(share[:, np.newaxis] * n_pieces - np.arange(n_pieces), 0.0, 1.0)
+    half = leaf.half_width.copy()
+    half[:, 1:] = leaf.half_width[:, :-1] + part * np.diff(leaf.half_width, axis=1)
+    return leaf.segment_lengths * part, half
+
+
+def _change(organ: Organ, length: FloatArray, half: FloatArray, steps: FloatArray) -> FloatArray:
+    """Change (m, k, 9) of each segment per unit of each parameter, in the segment's own frame, by central differences
+    of a population: row 0 as it is, rows 1 .. k with a parameter raised by its step, rows k + 1 .. 2 k lowered."""
+    k = len(steps)
+    frame = organ.frame[0]  # (m, 3, 3)
+
+    def slope(values: FloatArray) -> FloatArray:
+        both = values[1:].reshape(2, k, *values.shape[1:])
+        difference: FloatArray = (both[0] - both[1]) / (2.0 * steps.reshape(k, *[1] * (values.ndim - 1)))
+        return difference
+
+    shift = np.einsum("mij,kmi->mkj", frame, slope(organ.axis[:, :-1]))
+    turn = np.einsum("mij,kmil->mkjl", frame, slope(organ.frame))  # skew
+    of_length, of_half = slope(length).T, slope(half).T
+    return np.concatenate(
+        [
+            shift,
+            np.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], axis=-1),
+            np.stack([of_length, of_half[:-1], of_half[1:]], axis=-1),
+        ],
+        axis=-1,
+    )
+
+
+def _pose_change(
+    origin: FloatArray, frame: FloatArray, turning: FloatArray, shifting: FloatArray, center: FloatArray
+) -> FloatArray:
+    """Translation and rotation (m, 6, 6) of segments per unit of turn (3) and shift (3), in their own frames.
+
+    All in the model's frame: origins (m, 3), frames (m, 3, 3), columns of the axes of turning and of the shifts.
+    """
+    arm = origin - center
+    by_turn = np.cross(turning.T[np.newaxis], arm[:, np.newaxis])  # (m, 3 turns, 3)
+    change = np.zeros((len(origin), 6, 6))
+    change[:, :3, :3] = np.einsum("mij,mti->mtj", frame, by_turn)
+    change[:, :3, 3:] = np.einsum("mij,it->mtj", frame, turning)
+    change[:, 3:, :3] = np.einsum("mij,it->mtj", frame, shifting)
+    return change
+
+
+def _left_jacobian(turn: FloatArray) -> FloatArray:
+    """Of the exponential map: Exp(turn + d) = Exp(J d) Exp(turn), for small d."""
+    angle = float(np.linalg.norm(turn))
+    x, y, z = turn
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    if angle < 1e-4:
+        first, second = 0.5, 1.0 / 6.0
+    else:
+        first, second = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    jacobian: FloatArray = np.eye(3) + first * cross + second * cross @ cross
+    return jacobian
