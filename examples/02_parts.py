@@ -1,4 +1,4 @@
-"""The parts of a fit, put together by hand: what phytofit.fit does, in the order in which it does it.
+"""The parts of a fit by the paper's method, put together by hand, in the order in which phytofit.fit uses them.
 
 A step can be left out or replaced here; the next examples replace the distance, the species and the optimiser.
 """
@@ -21,7 +21,7 @@ points = cloud.points[phytofit.remove_outliers(cloud.points)]
 print(f"{len(points)} of {len(cloud)} points are no outliers")
 
 # 2. Where the stem stands and on which side the leaf is.
-species = phytofit.load_species("sorghum")
+species = phytofit.load_species("sorghum").leading(7)  # Eq. (1), and the stem above the leaf
 start = phytofit.start_poses(points, stem_radius=2.7, up=np.array([0.0, 0.0, 1.0]))[0]
 print(f"a stem of {2 * start.radius:.1f} cm, from {-start.foot:.1f} cm below the leaf to {start.top:.1f} cm above it")
 

@@ -41,7 +41,7 @@ made = phytofit.simulate(outlier_share=0.05, seed=3)
 truth = {trait.name: trait.value for trait in phytofit.measure(made.organs)}
 print(f"{len(made.points)} points, one in twenty-one of them an outlier")
 for name in ("hausdorff", "truncated"):
-    result = phytofit.fit(made.points, "cm", distance=name, **small)
+    result = phytofit.fit(made.points, "cm", method="paper", distance=name, **small)
     traits = {trait.name: trait.value for trait in result.traits}
     print(f"{name} distance {result.error:.2f} cm")
     for trait in ("stem_diameter", "leaf_length", "leaf_angle", "leaf_width"):

@@ -17,7 +17,7 @@ import phytofit
 from phytofit.cli import app
 from phytofit.results import COLUMNS, result_names
 
-FAST = ["--samples", "60", "--points", "500", "--generations", "3"]
+FAST = ["--method", "paper", "--samples", "60", "--points", "500", "--generations", "3"]
 FILES = {"fit.json", "traits.csv", "model.ply", "fit.png", "convergence.png"}
 
 
@@ -82,6 +82,26 @@ def test_fit_measures_several_clouds_and_writes_everything(clouds, tmp_path):
             assert image[..., :3].std() > 0.05  # not blank
     together = pd.read_csv(tmp_path / "traits.csv")
     assert list(together.cloud.unique()) == ["phytomer_0001", "phytomer_0002"]
+
+
+def test_fit_by_default_writes_intervals_and_the_same_bytes_with_one_and_two_threads(clouds, tmp_path):
+    for threads in (1, 2):
+        done = run("fit", clouds / "phytomer_0001.ply", "-u", "cm", "--threads", threads, "-o", tmp_path / str(threads))
+        assert done.exit_code == 0, done.output
+    assert "95 % interval" in done.output
+    assert "cm on the stem" in done.output
+    folder = tmp_path / "1" / "phytomer_0001"
+    table = pd.read_csv(folder / "traits.csv")
+    assert (table.low < table.value).all()
+    assert (table.value < table.high).all()
+    assert set(table.method) == {"likelihood, 95 % sandwich interval"}
+    stored = json.loads((folder / "fit.json").read_text())
+    length = stored["parameters"]["leaf_length"]
+    assert length["low"] < length["value"] < length["high"]
+    assert stored["noise"]["leaf"] == pytest.approx(0.2, abs=0.03)
+    assert stored["share"]["outliers"] < 0.02
+    for name in FILES:
+        assert (folder / name).read_bytes() == (tmp_path / "2" / "phytomer_0001" / name).read_bytes(), name
 
 
 def test_model_is_in_the_frame_and_unit_of_the_input(clouds, tmp_path):
@@ -228,9 +248,10 @@ def test_recipe_prints_every_setting_as_json():
     done = run("recipe")
     assert done.exit_code == 0
     recipe = json.loads(done.output)
-    assert recipe["fit"]["n_samples"] == 500
     assert recipe["fit"]["n_points"] == 5000
-    assert recipe["fit"]["n_generations"] == 10
+    assert recipe["method_paper"]["n_samples"] == 500
+    assert recipe["method_paper"]["n_generations"] == 10
+    assert recipe["method_likelihood"]["n_samples"] == 100
     assert recipe["fit"]["elite_fraction"] == 0.1
     assert recipe["objective"]["tilts_deg"]
 
@@ -257,7 +278,7 @@ def test_demo_as_installed_prints_estimate_beside_truth(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "Estimate beside truth" in done.stdout
     rows = [line.split("│") for line in done.stdout.splitlines() if "│" in line]
-    shown = {row[1].strip(): (float(row[2]), float(row[3])) for row in rows}
+    shown = {row[1].strip(): (float(row[2]), float(row[4])) for row in rows}
     estimate, truth = shown["leaf_length"]
-    assert estimate == pytest.approx(truth, abs=4.0)
+    assert estimate == pytest.approx(truth, abs=1.0)
     assert (tmp_path / "phytomer_0001" / "fit.png").stat().st_size > 20_000

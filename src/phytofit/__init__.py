@@ -18,14 +18,17 @@ from phytofit.errors import (
     Status,
     UnitError,
 )
-from phytofit.fitting import Fit, fit, minimise
+from phytofit.fitting import Fit, fit
 from phytofit.formats import read_cloud, write_cloud
+from phytofit.likelihood import CloudLikelihood
 from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move
-from phytofit.objectives import PaperObjective, Registration
+from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parameters import Parameter, ParameterSpace
 from phytofit.plots import plot_convergence, plot_fit
 from phytofit.pose import StartPose, start_poses
+from phytofit.posterior import Estimate
+from phytofit.preparation import Prepared, prepare
 from phytofit.recipe import recipe
 from phytofit.results import save_fit, trait_table
 from phytofit.simulation import SimulatedPhytomer, add_noise, add_outliers, occlude, simulate
@@ -35,7 +38,9 @@ from phytofit.traits import Trait, measure
 __all__ = [
     "DISTANCES",
     "CloudError",
+    "CloudLikelihood",
     "CrossEntropy",
+    "Estimate",
     "Fit",
     "Generation",
     "InputError",
@@ -48,6 +53,7 @@ __all__ = [
     "PhytofitError",
     "Phytomer",
     "PointCloud",
+    "Prepared",
     "Reference",
     "Registration",
     "SettingError",
@@ -71,6 +77,7 @@ __all__ = [
     "occlude",
     "plot_convergence",
     "plot_fit",
+    "prepare",
     "read_cloud",
     "recipe",
     "remove_outliers",

@@ -15,14 +15,14 @@ from rich.table import Table
 from phytofit.cloud import PointCloud
 from phytofit.distances import DISTANCES
 from phytofit.errors import PhytofitError, SettingError
-from phytofit.fitting import AXES, Fit, fit, parse_up
+from phytofit.fitting import AXES, METHODS, Fit, fit, parse_up
 from phytofit.formats import read_cloud, write_cloud
-from phytofit.optimize import CrossEntropy, Generation
+from phytofit.optimize import Generation
 from phytofit.recipe import defaults, recipe
 from phytofit.results import prepare_folder, result_names, save_fit, table_text, trait_table, write_text
 from phytofit.simulation import SimulatedPhytomer, simulate
 from phytofit.species import Species, load_species, species_names
-from phytofit.traits import measure
+from phytofit.traits import Trait, measure
 
 __all__ = ["app", "main"]
 
@@ -37,6 +37,11 @@ out = Console()
 err = Console(stderr=True)
 FIT = defaults(fit)
 SIMULATE = defaults(simulate)
+
+
+def _by_method(setting: str) -> str:
+    return ", ".join(f"{defaults(function)[setting]} for {name}" for name, function in METHODS.items())
+
 
 Seed = Annotated[int, typer.Option(help="The same seed gives the same result.", min=0)]
 SpeciesOption = Annotated[
@@ -53,13 +58,26 @@ def fit_command(
     ] = None,
     species: SpeciesOption = FIT["species"],
     up: Annotated[str | None, typer.Option(help=f"Upward direction where it is known: {', '.join(AXES)}.")] = None,
-    method: Annotated[str, typer.Option(help="paper: the search of Sodhi et al., IROS 2018.")] = FIT["method"],
-    distance: Annotated[str, typer.Option(help=f"What is minimised: {', '.join(DISTANCES)}.")] = FIT["distance"],
-    samples: Annotated[int, typer.Option(help="Candidates a generation.")] = FIT["n_samples"],
-    points: Annotated[int, typer.Option(help="Points a candidate, and of the cloud after thinning.")] = FIT["n_points"],
-    generations: Annotated[int, typer.Option(help="Generations of the search.")] = defaults(CrossEntropy.__init__)[
-        "n_generations"
-    ],
+    method: Annotated[
+        str,
+        typer.Option(
+            help="likelihood: the most probable phytomer, with 95 % intervals. "
+            "paper: the search of Sodhi et al., IROS 2018, as it stands there."
+        ),
+    ] = FIT["method"],
+    distance: Annotated[
+        str | None,
+        typer.Option(help=f"What --method paper minimises: {', '.join(DISTANCES)}; hausdorff by default."),
+    ] = None,
+    samples: Annotated[
+        int | None, typer.Option(help=f"Candidates a generation of the search; by default {_by_method('n_samples')}.")
+    ] = None,
+    points: Annotated[
+        int, typer.Option(help="Points of the cloud after thinning; for --method paper also of a candidate.")
+    ] = FIT["n_points"],
+    generations: Annotated[
+        int | None, typer.Option(help=f"Generations of the search; by default {_by_method('n_generations')}.")
+    ] = None,
     random_start: Annotated[
         bool, typer.Option("--random-start", help="Start from means drawn from the prior (Fig. 7d of the paper).")
     ] = FIT["random_start"],
@@ -106,7 +124,7 @@ def fit_command(
     for path, name in zip(clouds, result_names(clouds), strict=True):
         try:
             cloud = _read(path, units, labels)
-            result = _fit_with_progress(cloud, name, generations, settings)
+            result = _fit_with_progress(cloud, name, settings)
             where = save_fit(result, cloud, folder, name)
         except SettingError as error:  # as wrong for every other cloud
             _complain(error)
@@ -184,21 +202,20 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
     species = load_species()
     made = simulate(species, n_spheres=2, seed=seed)
     cloud_file = folder / "phytomer_0001.ply"
-    _or_exit(lambda: _write_simulated(made, species, folder, "phytomer_0001"))
+    _or_exit(lambda: _write_simulated(made, species, folder, "phytomer_0001", labels=False))
     out.print(
         f"Simulated a phytomer: {len(made.points)} points, 0.5 cm noise, two 6 cm spheres cut out, "
         f"random pose.\nMeasuring it: phytofit fit {cloud_file} --units cm --out {folder}",
         highlight=False,
     )
     cloud = _or_exit(lambda: read_cloud(cloud_file, "cm"))
-    generations = defaults(CrossEntropy.__init__)["n_generations"]
-    result = _or_exit(lambda: _fit_with_progress(cloud, cloud.name, generations, {"species": species, "seed": seed}))
+    result = _or_exit(lambda: _fit_with_progress(cloud, cloud.name, {"species": species, "seed": seed}))
     where = _or_exit(lambda: save_fit(result, cloud, folder))
     table = Table(title="Estimate beside truth")
-    for column in ("trait", "estimate", "truth", "unit"):
-        table.add_column(column, justify="right" if column in ("estimate", "truth") else "left")
+    for column in ("trait", "estimate", "95 % interval", "truth", "unit"):
+        table.add_column(column, justify="left" if column in ("trait", "unit") else "right")
     for estimate, truth in zip(result.traits, measure(made.organs), strict=True):
-        table.add_row(estimate.name, f"{estimate.value:.2f}", f"{truth.value:.2f}", estimate.unit)
+        table.add_row(estimate.name, f"{estimate.value:.2f}", _interval(estimate), f"{truth.value:.2f}", estimate.unit)
     out.print(table)
     _print_remarks(result)
     out.print(f"The model on the points: {where / 'fit.png'}", highlight=False)
@@ -216,7 +233,9 @@ def _read(path: Path, units: str | None, labels: str) -> PointCloud:
         return read_cloud(path, units, label_property=labels)
 
 
-def _fit_with_progress(cloud: PointCloud, name: str, generations: int, settings: dict[str, Any]) -> Fit:
+def _fit_with_progress(cloud: PointCloud, name: str, settings: dict[str, Any]) -> Fit:
+    by_default = defaults(METHODS.get(settings.get("method", FIT["method"]), fit))["n_generations"]
+    generations = settings.get("n_generations") or by_default
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[errors]}"))
     with Progress(*columns, TimeElapsedColumn(), console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task(f"{name}: start pose", total=generations, errors="")
@@ -230,16 +249,27 @@ def _fit_with_progress(cloud: PointCloud, name: str, generations: int, settings:
 
 def _print_fit(result: Fit, name: str, where: Path) -> None:
     table = Table(title=name)
-    for column in ("organ", "trait", "value", "unit"):
-        table.add_column(column, justify="right" if column == "value" else "left")
+    for column in ("organ", "trait", "value", "95 % interval", "unit"):
+        table.add_column(column, justify="right" if column in ("value", "95 % interval") else "left")
     for trait in result.traits:
-        table.add_row(trait.organ, trait.name, f"{trait.value:.2f}", trait.unit)
+        table.add_row(trait.organ, trait.name, f"{trait.value:.2f}", _interval(trait), trait.unit)
     out.print(table)
     _print_remarks(result)
-    error = f"{result.error:.2f} {'relative' if result.relative else 'cm'}"
-    out.print(
-        f"{result.settings['distance']} distance {error}; model on the points: {where / 'fit.png'}", highlight=False
-    )
+    unit = "relative" if result.relative else "cm"
+    if result.estimate is None:
+        said = f"{result.settings['distance']} distance {result.error:.2f} {unit}"
+    else:
+        stem, leaf, thickness = result.estimate.noise * result.scale
+        said = (
+            f"noise {stem:.2f} {unit} on the stem, {leaf:.2f} on the leaf, {thickness:.2f} more across it; "
+            f"{100 * result.estimate.share[2]:.0f} % outliers"
+        )
+    out.print(f"{said}; model on the points: {where / 'fit.png'}", highlight=False)
+
+
+def _interval(trait: Trait) -> str:
+    low, high = ("" if end is None else f"{end:.2f}" for end in (trait.low, trait.high))
+    return f"{low} – {high}" if low or high else ""
 
 
 def _print_remarks(result: Fit) -> None:
@@ -261,8 +291,10 @@ def _parse_parameters(texts: list[str], species: Species) -> dict[str, float]:
     return fixed
 
 
-def _write_simulated(made: SimulatedPhytomer, species: Species, folder: Path, name: str) -> None:
-    write_cloud(folder / f"{name}.ply", PointCloud(made.points, labels=made.labels, name=name))
+def _write_simulated(
+    made: SimulatedPhytomer, species: Species, folder: Path, name: str, *, labels: bool = True
+) -> None:
+    write_cloud(folder / f"{name}.ply", PointCloud(made.points, labels=made.labels if labels else None, name=name))
     truth = {
         "parameters": dict(zip(species.space.names, made.x.tolist(), strict=True)),
         "traits": {t.name: t.value for t in measure(made.organs)},

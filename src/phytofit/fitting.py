@@ -1,31 +1,40 @@
 """The one loop: cloud -> start pose -> search -> Fit."""
 
+import inspect
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phytofit.cloud import PointCloud, from_points, remove_outliers, size_cm, thin
+from phytofit.cloud import PointCloud, from_points
 from phytofit.distances import DISTANCES, Reference
 from phytofit.errors import SettingError, Status
 from phytofit.models import Organ, move
-from phytofit.objectives import PaperObjective, Registration
+from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parameters import ParameterSpace
-from phytofit.pose import StartPose, start_poses
+from phytofit.pose import StartPose
+from phytofit.posterior import Estimate, estimate
+from phytofit.preparation import Prepared, prepare
 from phytofit.species import Species, load_species
-from phytofit.traits import Trait, measure
+from phytofit.traits import CHORD_CM, Trait, measure
 
-__all__ = ["Fit", "fit", "minimise", "parse_up"]
+__all__ = ["METHODS", "Fit", "fit", "mean_at", "parse_up"]
 
 FloatArray = NDArray[np.float64]
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
+N_PAPER = 6  # parameters of Eq. (1)
+N_SEARCHED = 7  # those and the stem above the leaf
+SEARCH = ("n_samples", "n_generations", "elite_fraction", "covariance_noise")
+Z_95 = 1.959963984540054  # standard errors to either side of a 95 % interval
+INTERVAL_METHOD = "sandwich interval"
+OPEN_WITHOUT_TIP = ("leaf_length", "leaf_area")  # no upper end where the tip was not seen
 PLAUSIBLE_LEAD = 4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
-CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
 UP_DOUBTFUL = "the leaf leaves the stem downwards or bends up: is the stated up right?"
 UP_UNKNOWN = "up and down can't be told apart by this leaf: the more plausible is given; state up if it is known"
 
@@ -34,13 +43,16 @@ UP_UNKNOWN = "up and down can't be told apart by this leaf: the more plausible i
 class Fit:
     """A phytomer model fitted to a cloud.
 
-    ``x`` (k,) are the parameters, in the order of ``species.space``; ``covariance`` (k, k) is the spread of the last
-    elite: how far the search has contracted, not how far it is from the truth.  ``pose`` (4, 4) maps the model's frame
-    to the cloud's, cm; ``error`` is the distance there, cm; ``registration`` tells how ICP ended (in the start pose's
-    frame).  ``reference`` (m, 3) are the points that were fitted, in the cloud's frame, cm.  ``flags`` are remarks on
-    the result in plain words, ``notes`` on what was done to the cloud.  ``relative`` says that the cloud had no unit:
+    ``x`` (k,) are the parameters, in the order of ``species.space``; ``pose`` (4, 4) maps the model's frame to the
+    cloud's, cm.  By method "likelihood", ``covariance`` (k, k) is that of x's error, ``error`` minus the log posterior
+    (nats), and ``estimate`` has the rest, in the start pose's frame.  By method "paper", ``covariance`` is the spread
+    of the last elite: how far the search has contracted, not how far it is from the truth; ``error`` is the distance,
+    cm, and ``registration`` tells how ICP ended (in the start pose's frame).
+
+    ``reference`` (m, 3) are the points that were fitted, in the cloud's frame, cm.  ``flags`` are remarks on the
+    result in plain words, ``notes`` on what was done to the cloud.  ``relative`` says that the cloud had no unit:
     lengths are then relative to each other only, and ``scale`` of them make a cm of the prior (1 otherwise); `x`,
-    `history` and `registration` are in the prior's cm.  ``method`` and ``settings`` repeat the run.
+    `history`, `registration` and `estimate` are in the prior's cm.  ``settings`` repeat the run.
     """
 
     species: Species
@@ -48,22 +60,34 @@ class Fit:
     covariance: FloatArray
     pose: FloatArray
     error: float
-    registration: Registration
     history: tuple[Generation, ...]
     status: Status
     seed: int
     reference: FloatArray
+    method: str
+    registration: Registration | None = None
+    estimate: Estimate | None = None
     flags: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    method: str = "paper"
     relative: bool = False
     scale: float = 1.0
     settings: dict[str, object] = field(default_factory=dict)
 
     @property
     def parameters(self) -> dict[str, float]:
-        """The parameters of Eq. (1) by name; lengths in cm (or relative), angles in degrees."""
+        """The parameters by name; lengths in cm (or relative), angles in degrees."""
         return dict(zip(self.species.space.names, self._in_units(self.x).tolist(), strict=True))
+
+    @property
+    def parameter_intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % interval of each parameter, within its bounds; empty where the method gives none."""
+        if self.estimate is None:
+            return {}
+        space = self.species.space
+        half = Z_95 * np.sqrt(np.diag(self.covariance))
+        low = self._in_units(np.maximum(self.x - half, space.lower)).tolist()
+        high = self._in_units(np.minimum(self.x + half, space.upper)).tolist()
+        return dict(zip(space.names, zip(low, high, strict=True), strict=True))
 
     def _in_units(self, x: FloatArray) -> FloatArray:
         return np.where(np.array(self.species.space.units) == "cm", x * self.scale, x)
@@ -71,22 +95,62 @@ class Fit:
     @property
     def organs(self) -> tuple[Organ, ...]:
         """Stem and leaf in the cloud's frame, cm."""
-        own = (o.row(0) for o in self.species.model.organs(self.x))
-        scaled = tuple(Organ(o.kind, o.axis * self.scale, o.frame, o.half_width * self.scale) for o in own)
-        return move(scaled, self.pose)
+        return move(self._organs_of(self.x), self.pose)
 
-    @property
+    def _organs_of(self, x: FloatArray) -> tuple[Organ, ...]:
+        own = (o.row(0) for o in self.species.model.organs(x))
+        return tuple(Organ(o.kind, o.axis * self.scale, o.frame, o.half_width * self.scale) for o in own)
+
+    @cached_property
     def traits(self) -> list[Trait]:
-        """The traits, measured on the fitted organs; lengths in "rel" in place of "cm" where the cloud had no unit."""
+        """The traits, measured on the fitted organs, with 95 % intervals where the method gives them.
+
+        Lengths are in "rel" in place of "cm" where the cloud had no unit.
+        """
+        traits = self._measured(self.x)
+        if self.estimate is not None:
+            std = self._trait_std(np.array([trait.value for trait in traits]))
+            open_above = () if self.estimate.tip_seen else OPEN_WITHOUT_TIP
+            traits = [
+                replace(
+                    trait,
+                    low=max(0.0, trait.value - Z_95 * s),
+                    high=None if trait.name in open_above else trait.value + Z_95 * s,
+                )
+                if np.isfinite(s)
+                else trait
+                for trait, s in zip(traits, std.tolist(), strict=True)
+            ]
         if not self.relative:
-            return measure(self.organs, method=self.method, flags=self.flags)
-        traits = measure(self.organs, chord_cm=np.inf, method=self.method, flags=self.flags)
+            return traits
         return [replace(trait, unit=trait.unit.replace("cm", "rel")) for trait in traits]
+
+    def _measured(self, x: FloatArray) -> list[Trait]:
+        method = self.method if self.estimate is None else f"{self.method}, 95 % {INTERVAL_METHOD}"
+        chord = np.inf if self.relative else CHORD_CM
+        return measure(self._organs_of(x), chord_cm=chord, method=method, flags=self.flags)
+
+    def _trait_std(self, values: FloatArray) -> FloatArray:
+        """Standard errors of the traits by the delta method, slopes taken over one standard error of each parameter."""
+        steps = 0.5 * np.sqrt(np.diag(self.covariance))
+        slopes = np.zeros((len(values), len(steps)))
+        for i in np.flatnonzero(steps):
+            ends = []
+            for sign in (1.0, -1.0):
+                x = self.x.copy()
+                x[i] += sign * steps[i]
+                ends.append(np.array([trait.value for trait in self._measured(x)]))
+            slopes[:, i] = (ends[0] - ends[1]) / (2.0 * steps[i])
+        std: FloatArray = np.sqrt(np.einsum("ti,ij,tj->t", slopes, self.covariance, slopes))
+        return std
 
     @property
     def elite_std(self) -> dict[str, float]:
-        """Spread of each parameter in the last elite; not an error of the estimate."""
-        return dict(zip(self.species.space.names, self._in_units(np.sqrt(np.diag(self.covariance))), strict=True))
+        """Spread of each parameter in the last elite of the search; not an error of the estimate."""
+        last = np.sqrt(np.diag(self.history[-1].cov))
+        units = self.species.space.units[: len(last)]
+        scaled = [s * self.scale if unit == "cm" else s for s, unit in zip(last.tolist(), units, strict=True)]
+        return dict(zip(self.species.space.names, scaled, strict=False))
 
 
 def parse_up(up: str | ArrayLike | None) -> FloatArray | None:
@@ -110,11 +174,11 @@ def fit(
     *,
     species: Species | str | os.PathLike[str] = "sorghum",
     up: str | ArrayLike | None = None,
-    method: str = "paper",
-    distance: str = "hausdorff",
-    n_samples: int = 500,
+    method: str = "likelihood",
+    distance: str | None = None,
+    n_samples: int | None = None,
     n_points: int = 5000,
-    n_generations: int = 10,
+    n_generations: int | None = None,
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
     random_start: bool = False,
@@ -131,9 +195,12 @@ def fit(
     units : "cm", "mm", "m", or "none" for relative lengths; needed for bare points
     species : name of a species that comes with phytofit, a TOML file, or a Species
     up : "x", "-x", .. "-z" or a vector, where the upward direction is known
-    method : "paper", the cross-entropy search of Sodhi et al., IROS 2018
-    distance : what is minimised: hausdorff (the paper's), quantile, chamfer, labels
-    n_samples, n_points, n_generations : candidates a generation, points a candidate, generations
+    method : "likelihood", the most probable phytomer, with intervals; or "paper", the cross-entropy search of Sodhi et
+        al., IROS 2018, for the least distance between the clouds
+    distance : what the paper's method minimises: hausdorff (its own), quantile, chamfer, labels
+    n_samples, n_generations : of the cross-entropy search: 500 candidates in each of 10 generations for "paper",
+        100 in each of 5 for "likelihood", which is refined afterwards
+    n_points : to which the cloud is thinned; for "paper" also of each candidate
     elite_fraction, covariance_noise : see :class:`phytofit.CrossEntropy`
     random_start : start the search from means drawn from the prior (as in Fig. 7d), not from the prior's and, for
         the stem's lengths, from the start pose
@@ -144,9 +211,11 @@ def fit(
 
     Raises InputError (a ValueError) for what can't be used, NoPhytomerError where there is no stem with a leaf.
     """
-    if method != "paper":
-        raise SettingError(f"method: expected 'paper', got {method!r}")
-    if distance not in DISTANCES:
+    if method not in METHODS:
+        raise SettingError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
+    if distance is not None and method != "paper":
+        raise SettingError(f"distance: expected with method 'paper' only, got {distance!r} with {method!r}")
+    if distance is not None and distance not in DISTANCES:
         raise SettingError(f"distance: expected one of {', '.join(DISTANCES)}, got {distance!r}")
     for name, value, least in (("points", n_points, 100), ("seed", seed, 0), ("threads", threads, 1)):
         if value is not None and value < least:
@@ -157,70 +226,36 @@ def fit(
         cloud = from_points(cloud, units)
     elif units not in (None, cloud.unit):
         raise SettingError(f"units: {cloud.name} was read in {cloud.unit}, got {units!r}; leave units out")
+    search: dict[str, Any] = {"elite_fraction": elite_fraction, "covariance_noise": covariance_noise}
+    given = {"n_samples": n_samples, "n_generations": n_generations, "distance": distance}
+    search |= {name: value for name, value in given.items() if value is not None}
+    used = {**_defaults(METHODS[method]), **search}
+    CrossEntropy(species.space, **{name: value for name, value in used.items() if name in SEARCH})  # checks them
     if not stem_above:
-        species = species.without("stem_length_above")
-    search = partial(
-        CrossEntropy,
-        species.space,
-        n_samples=n_samples,
-        n_generations=n_generations,
-        elite_fraction=elite_fraction,
-        covariance_noise=covariance_noise,
-        seed=seed,
-    )
-    search()  # checks its settings before any work is done
-
-    keep = remove_outliers(cloud.points)
-    clean = cloud.take(keep)
-    relative = cloud.unit == "none"
-    scale = size_cm(clean.points) / _expected_size(species) if relative else 1.0
-    starts = start_poses(clean.points / scale, _largest_stem_radius(species), up=direction)
-    mean = _random_mean(species.space, seed) if random_start else _mean_at(starts[0], species.space)
-
-    # the cloud as it looks from the best start pose, rounded: a rotated copy of the cloud gives the same numbers
-    home = starts[0].pose
-    upright = np.round((clean.points / scale - home[:3, 3]) @ home[:3, :3], CANONICAL_DECIMALS)
-    kept = thin(upright, n_points)
+        species = species.leading(N_PAPER)
+    found = prepare(cloud, species, n_points=n_points, up=direction, with_outliers=method == "likelihood")
+    means = [mean_at(start, species.leading(N_SEARCHED).space) for start in found.starts]
+    if random_start:
+        means[0] = _random_mean(species.leading(N_SEARCHED).space, seed)
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
-        objective = PaperObjective(
-            species.model,
-            Reference.of(upright[kept], None if clean.labels is None else _organ_numbers(clean.labels[kept])),
-            starts=[np.round(_rigid_inverse(home) @ start.pose, CANONICAL_DECIMALS) for start in starts],
-            n_points=n_points,
-            distance=DISTANCES[distance],
-            seed=seed,
-            executor=executor,
+        result = METHODS[method](
+            found, species, means, n_points=n_points, seed=seed, executor=executor, progress=progress, **search
         )
-        last = minimise(search(mean=mean), objective, progress)
-        registration, error = objective.register(last.mean)
-
-    status = Status.CONVERGED if error <= last.history[-1].threshold else Status.SPLIT_ELITE
-    pose = home @ registration.T_target_source
-    pose[:3, 3] *= scale
-    result = Fit(
-        species=species,
-        x=last.mean,
-        covariance=last.history[-1].cov,
+    pose = found.home @ result.pose
+    pose[:3, 3] *= found.scale
+    result = replace(
+        result,
         pose=pose,
-        error=error * scale,
-        registration=registration,
-        history=tuple(last.history),
-        status=status,
-        seed=seed,
-        reference=clean.points[kept],
-        flags=(status.value,) if status is Status.SPLIT_ELITE else (),
-        notes=(*cloud.notes, *_what_was_left_out(len(cloud), len(clean), len(kept))),
-        method=method,
-        relative=relative,
-        scale=scale,
+        error=result.error * found.scale if method == "paper" else result.error,
+        reference=found.used.points[found.kept],
+        flags=(*((result.status.value,) if not result.status.good else ()), *result.flags),
+        notes=(*cloud.notes, *found.notes),
+        relative=cloud.unit == "none",
+        scale=found.scale,
         settings={
             "method": method,
-            "distance": distance,
-            "n_samples": n_samples,
+            **used,
             "n_points": n_points,
-            "n_generations": n_generations,
-            "elite_fraction": elite_fraction,
-            "covariance_noise": covariance_noise,
             "random_start": random_start,
             "stem_above": stem_above,
             "up": None if direction is None else direction.tolist(),
@@ -229,18 +264,115 @@ def fit(
     return _right_way_up(result, direction)
 
 
-def minimise(
-    search: CrossEntropy,
-    objective: Callable[[FloatArray, int], FloatArray],
-    progress: Callable[[Generation], None] | None = None,
-) -> CrossEntropy:
-    """Run the search to its end on ``objective(xs (n, k), n_elite) -> errors (n,)`` and return it."""
-    while not search.done:
-        xs = search.ask()
-        generation = search.tell(xs, objective(xs, search.n_elite))
-        if progress is not None:
-            progress(generation)
-    return search
+def fit_paper(
+    found: Prepared,
+    species: Species,
+    means: Sequence[FloatArray],
+    *,
+    n_points: int,
+    seed: int,
+    executor: Executor,
+    progress: Callable[[Generation], None] | None,
+    distance: str = "hausdorff",
+    n_samples: int = 500,
+    n_generations: int = 10,
+    elite_fraction: float = 0.1,
+    covariance_noise: float = 0.5,
+) -> Fit:
+    """The paper's method: cross-entropy search for the phytomer whose points, aligned by ICP, lie nearest the cloud."""
+    species = species.leading(len(means[0]))
+    objective = PaperObjective(
+        species.model,
+        Reference.of(found.points, found.organ),
+        starts=[start.pose for start in found.starts],
+        n_points=n_points,
+        distance=DISTANCES[distance],
+        seed=seed,
+        executor=executor,
+    )
+    search = CrossEntropy(
+        species.space,
+        n_samples=n_samples,
+        n_generations=n_generations,
+        elite_fraction=elite_fraction,
+        covariance_noise=covariance_noise,
+        mean=means[0],
+        seed=seed,
+    )
+    minimise(search, objective, progress)
+    registration, error = objective.register(search.mean)
+    return Fit(
+        species=species,
+        x=search.mean,
+        covariance=search.history[-1].cov,
+        pose=registration.T_target_source,
+        error=error,
+        history=tuple(search.history),
+        status=Status.CONVERGED if error <= search.history[-1].threshold else Status.SPLIT_ELITE,
+        seed=seed,
+        reference=found.points,
+        method="paper",
+        registration=registration,
+    )
+
+
+def fit_likelihood(
+    found: Prepared,
+    species: Species,
+    means: Sequence[FloatArray],
+    *,
+    n_points: int,
+    seed: int,
+    executor: Executor,
+    progress: Callable[[Generation], None] | None,
+    n_samples: int = 100,
+    n_generations: int = 5,
+    elite_fraction: float = 0.1,
+    covariance_noise: float = 0.5,
+) -> Fit:
+    """The most probable phytomer: a short cross-entropy search, then refinement of the likelihood of the cloud."""
+    most_probable = estimate(
+        species,
+        found.points,
+        [(mean, _foot_pose(start)) for mean, start in zip(means, found.starts, strict=True)],
+        organ=found.organ,
+        n_samples=n_samples,
+        n_generations=n_generations,
+        elite_fraction=elite_fraction,
+        covariance_noise=covariance_noise,
+        seed=seed,
+        executor=executor,
+        progress=progress,
+    )
+    return Fit(
+        species=species.leading(len(most_probable.x)),
+        x=most_probable.x,
+        covariance=most_probable.covariance,
+        pose=most_probable.pose,
+        error=most_probable.error,
+        history=most_probable.history,
+        status=Status.AT_REST if most_probable.converged else Status.MOVING,
+        seed=seed,
+        reference=found.points,
+        method="likelihood",
+        estimate=most_probable,
+        flags=most_probable.flags,
+    )
+
+
+METHODS: dict[str, Callable[..., Fit]] = {"likelihood": fit_likelihood, "paper": fit_paper}
+
+
+def _foot_pose(start: StartPose) -> FloatArray:
+    """The start with the stem's foot as its origin, as the model has it."""
+    pose = start.pose.copy()
+    pose[:3, 3] += start.foot * start.pose[:3, 2]
+    return pose
+
+
+def _defaults(function: Callable[..., Fit]) -> dict[str, Any]:
+    parameters = inspect.signature(function).parameters.values()
+    return {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
 
 
 def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
@@ -255,13 +387,15 @@ def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
         return result
     turn, offset, pose = result.species.model.upside_down(result.x)
     pose[:3, 3] *= result.scale
+    searched = len(result.history[0].mean)
+    part, shift = turn[:searched, :searched], offset[:searched]
     twin = replace(
         result,
         x=turn @ result.x + offset,
         covariance=turn @ result.covariance @ turn.T,
         pose=result.pose @ pose,
         history=tuple(
-            replace(g, mean=turn @ g.mean + offset, cov=turn @ g.cov @ turn.T, best_x=turn @ g.best_x + offset)
+            replace(g, mean=part @ g.mean + shift, cov=part @ g.cov @ part.T, best_x=part @ g.best_x + shift)
             for g in result.history
         ),
     )
@@ -282,45 +416,13 @@ def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
     return better
 
 
-def _rigid_inverse(pose: FloatArray) -> FloatArray:
-    inverse = np.eye(4)
-    inverse[:3, :3] = pose[:3, :3].T
-    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
-    return inverse
-
-
-def _organ_numbers(labels: NDArray[np.int64]) -> NDArray[np.int8]:
-    """Labels count 0 unknown, 1 stem, 2.. leaves; organs 0 stem, 1 leaf, -1 unknown."""
-    return np.clip(labels - 1, -1, 1).astype(np.int8)
-
-
-def _what_was_left_out(n_read: int, n_clean: int, n_kept: int) -> list[str]:
-    said = []
-    if n_clean < n_read:
-        said.append(f"{n_read - n_clean} of {n_read} points removed as outliers")
-    if n_kept < n_clean:
-        said.append(f"{n_clean} points thinned to {n_kept}")
-    return said
-
-
-def _largest_stem_radius(species: Species) -> float:
-    i = species.space.index("stem_diameter")
-    return float(0.5 * (species.space.mean[i] + 2.0 * species.space.std[i]))
-
-
-def _expected_size(species: Species) -> float:
-    """Size, as :func:`size_cm` takes it, of the phytomer that the prior expects."""
-    nodes = np.concatenate([o.axis[0] for o in species.model.organs(species.space.mean)])
-    return size_cm(nodes)
-
-
 def _random_mean(space: ParameterSpace, seed: int) -> FloatArray:
     """A start drawn from the prior within its bounds (Fig. 7d)."""
     drawn: FloatArray = CrossEntropy(space, n_samples=2, elite_fraction=0.9, seed=seed).ask()[0]
     return drawn
 
 
-def _mean_at(start: StartPose, space: ParameterSpace) -> FloatArray:
+def mean_at(start: StartPose, space: ParameterSpace) -> FloatArray:
     """The prior's mean, with the stem's lengths as the start pose saw them."""
     mean = space.mean
     seen = {"stem_length": -start.foot, "stem_length_above": start.top}

@@ -69,7 +69,8 @@ def _draw(ax: Axes, organ: Organ, a: int, b: int) -> None:
 
 def plot_convergence(result: Fit) -> Figure:
     """Mean and spread of the elite for each parameter, and its errors, over the generations (Fig. 6b)."""
-    names, units = result.species.space.names, result.species.space.units
+    searched = len(result.history[0].mean)
+    names, units = result.species.space.names[:searched], result.species.space.units[:searched]
     generation = np.array([g.index for g in result.history])
     mean = np.array([g.mean for g in result.history])
     std = np.array([np.sqrt(np.diag(g.cov)) for g in result.history])
@@ -81,6 +82,8 @@ def plot_convergence(result: Fit) -> Figure:
     for i, (ax, name, unit) in enumerate(zip(axes, names, units, strict=False)):
         ax.fill_between(generation, mean[:, i] - std[:, i], mean[:, i] + std[:, i], color="#0072B2", alpha=0.25, lw=0)
         ax.plot(generation, mean[:, i], color="#0072B2", marker="o", markersize=3)
+        if result.estimate is not None:
+            ax.axhline(result.parameters[name], color="black", lw=1.0, ls="--")
         ax.set_title(name.replace("_", " "), fontsize=10)
         ax.set_ylabel("relative length" if result.relative and unit == "cm" else unit)
     ax = axes[len(names)]
@@ -98,7 +101,8 @@ def plot_convergence(result: Fit) -> Figure:
     for ax in axes[len(names) + 1 :]:
         ax.remove()
     figure.suptitle(
-        "Elite mean and standard deviation in each generation: how far the search has contracted, not the error",
+        "Elite mean and standard deviation in each generation of the search: how far it has contracted, not the error"
+        + ("; dashed: after refinement" if result.estimate is not None else ""),
         fontsize=11,
     )
     return figure

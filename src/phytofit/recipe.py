@@ -6,13 +6,15 @@ from typing import Any
 
 from phytofit.cloud import remove_outliers, thin
 from phytofit.distances import chamfer, hausdorff, labelled_hausdorff, quantile_hausdorff
-from phytofit.fitting import Fit, fit
+from phytofit.fitting import Fit, fit, fit_likelihood, fit_paper
 from phytofit.objectives import PaperObjective
 
 __all__ = ["defaults", "recipe", "recipe_of"]
 
 STEPS: dict[str, Callable[..., Any]] = {
     "fit": fit,
+    "method_likelihood": fit_likelihood,
+    "method_paper": fit_paper,
     "remove_outliers": remove_outliers,
     "thin": thin,
     "objective": PaperObjective,

@@ -110,6 +110,7 @@ def table_text(table: pd.DataFrame) -> str:
 def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
     """What fit.json holds; no times, so that the same run gives the same bytes."""
     space = result.species.space
+    intervals = result.parameter_intervals
     traits = trait_table(name, result.traits).drop(columns=["cloud", "flags"]).replace({np.nan: None})
     return {
         "phytofit": version("phytofit"),
@@ -130,17 +131,14 @@ def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
         "flags": list(result.flags),
         "notes": list(result.notes),
         "parameters": {
-            p: {"value": value, "low": None, "high": None, "unit": _unit(unit, result)}
+            p: dict(zip(("value", "low", "high"), (value, *intervals.get(p, (None, None))), strict=True))
+            | {"unit": _unit(unit, result)}
             for (p, value), unit in zip(result.parameters.items(), space.units, strict=True)
         },
         "traits": traits.to_dict(orient="records"),
         "error": result.error,
         "pose": result.pose.tolist(),
-        "registration": {
-            "rmse": result.registration.rmse,
-            "iterations": result.registration.iterations,
-            "converged": result.registration.converged,
-        },
+        **_how_it_ended(result),
         "history": [
             {
                 "generation": g.index,
@@ -154,6 +152,25 @@ def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
         ],
         "seed": result.seed,
         "settings": recipe_of(result),
+    }
+
+
+def _how_it_ended(result: Fit) -> dict[str, Any]:
+    """What only one of the methods has: the registration of the paper's, the noise and shares of the likelihood's."""
+    if result.registration is not None:
+        ended = result.registration
+        return {
+            "registration": {"rmse": ended.rmse, "iterations": ended.iterations, "converged": ended.converged},
+        }
+    assert result.estimate is not None
+    made = result.estimate
+    noise = made.noise * result.scale
+    return {
+        "noise": dict(zip(("stem", "leaf", "leaf_thickness"), noise.tolist(), strict=True)),
+        "share": dict(zip(("stem", "leaf", "outliers"), made.share.tolist(), strict=True)),
+        "evidence": made.evidence,
+        "variance_inflation": made.inflation,
+        "covariance": result.covariance.tolist(),
     }
 
 

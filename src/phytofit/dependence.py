@@ -1,0 +1,136 @@
+"""How far errors of neighbouring points depend on each other, and what that does to an estimate's variance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import coo_array
+from scipy.spatial import cKDTree
+
+from phytofit.likelihood import CloudLikelihood, State
+from phytofit.models import Organ, move
+
+__all__ = ["Dependence", "score_dependence"]
+
+FloatArray = NDArray[np.float64]
+SHIFT = 0.3  # of the noise: by so much points are moved to see how their scores change
+SURE = 0.9  # probability of its organ, of a point whose error is looked at
+N_PROBED = 400  # points whose neighbours' errors are compared with theirs
+LAG_CM = 0.25  # width of the distance classes for that
+LONGEST_CM = 10.0
+REACHES_CM = np.geomspace(0.2, 6.0, 30)
+CLEAR = 4.0  # standard errors by which a correlation must differ from none
+CELL = 0.5  # of the reach: points within such a cell count as one place
+CUT = 2.5  # reaches at which the correlation counts as none
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """``variability`` (k, k): covariance of the sum of the scores; ``inflation``: how many times that of independent
+    points it is, on average; ``reach_cm``: standard deviation of the correlation's bell, 0 if there is none;
+    ``correlation`` at no distance."""
+
+    variability: FloatArray
+    inflation: float
+    reach_cm: float
+    correlation: float
+
+
+def score_dependence(likelihood: CloudLikelihood, state: State) -> Dependence:
+    """Covariance of the sum of scores of points whose errors are correlated with their neighbours'.
+
+    A spatial sandwich (Conley, J. Econometrics 92, 1999), but with a correlation that is first fitted to the points'
+    distances from the surface: a bell over distance, a exp(-d² / (2 reach²)).  A score depends on a point's place on
+    the surface, which is random too, so that products of neighbours' scores would not do; only the part that follows
+    the errors counts, the scores' change when a point is moved.  Misfit of the model is correlated as well, and counts.
+    """
+    scores = likelihood.evaluate(state).scores
+    independent = scores.T @ scores
+    on_stem = scores[:, -2] + state.share[0]
+    outlier = scores[:, -1] + state.share[2]
+    noise = state.noise
+    organs = move([o.row(0) for o in likelihood.model.organs(state.x)], likelihood.pose_of(state))
+    frame, distance = _local(organs, likelihood.points, on_stem > 0.5)
+    across = float(np.hypot(noise[1], noise[2]))
+    std = np.where((on_stem > 0.5)[:, np.newaxis], noise[0], [noise[1], noise[1], across])  # tangent, lateral, normal
+    errors = distance / std[:, 2]
+    sure = np.maximum(on_stem, 1.0 - on_stem - outlier) > SURE
+    for organ in (sure & (on_stem > 0.5), sure & (on_stem <= 0.5)):
+        errors[organ] -= errors[organ].mean() if organ.any() else 0.0  # noise moves points off a tube on average
+    # places on the surface: points that are near each other in space have been moved alike, by selection
+    place = likelihood.points - distance[:, np.newaxis] * frame[:, :, 2]
+    correlation, reach = _correlation(place[sure], errors[sure])
+    if correlation == 0.0:
+        return Dependence(independent, 1.0, 0.0, 0.0)
+
+    cell = np.floor(place / (CELL * reach)).astype(np.int64)
+    number = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    count = np.bincount(number)
+    center = np.stack([np.bincount(number, column) for column in place.T], axis=1) / count[:, np.newaxis]
+    pairs = cKDTree(center).query_pairs(CUT * reach, output_type="ndarray")
+    gap = np.linalg.norm(center[pairs[:, 0]] - center[pairs[:, 1]], axis=1)
+    weight = coo_array((np.exp(-0.5 * (gap / reach) ** 2), pairs.T), shape=(len(count), len(count))).tocsr()
+    extra = np.zeros_like(independent)
+    for a in range(3):
+        change = _change_of_scores(likelihood, state, frame[:, :, a], std[:, a])
+        sums = np.stack([np.bincount(number, column) for column in change.T], axis=1)
+        cross = sums.T @ (weight @ sums)
+        extra += sums.T @ sums - change.T @ change + cross + cross.T
+    variability = independent + correlation * extra
+    factor = cho_factor(independent + np.diag(likelihood.precision + 1e-9))
+    inflation = float(np.trace(cho_solve(factor, variability + np.diag(likelihood.precision)))) / len(independent)
+    return Dependence(variability, max(1.0, inflation), reach, correlation)
+
+
+def _change_of_scores(likelihood: CloudLikelihood, state: State, direction: FloatArray, std: FloatArray) -> FloatArray:
+    """Change (n, k) of each point's scores by one standard deviation `std` (n,) along its `direction` (n, 3)."""
+    shift = (SHIFT * std)[:, np.newaxis] * direction
+    there, back = (likelihood.at(likelihood.points + sign * shift).evaluate(state).scores for sign in (1.0, -1.0))
+    return (there - back) / (2.0 * SHIFT)
+
+
+def _local(organs: tuple[Organ, ...], points: FloatArray, on_stem: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Frames (n, 3, 3), columns along, across, normal, of the surface near each point, and distances (n,) from it."""
+    stem, leaf = organs
+    length = leaf.segment_lengths
+    offset = points[:, np.newaxis] - leaf.axis[:-1]
+    along = np.clip(np.einsum("nmi,mi->nm", offset, leaf.frame[:, :, 0]), 0.0, length)
+    gap = offset - along[..., np.newaxis] * leaf.frame[:, :, 0]
+    j = np.argmin(np.einsum("nmi,nmi->nm", gap, gap), axis=1)
+    frame = leaf.frame[j]
+    distance = np.einsum("ni,ni->n", offset[np.arange(len(points)), j], frame[:, :, 2])
+    axis = stem.frame[0, :, 0]
+    radial = points[on_stem] - stem.axis[0]
+    radial -= (radial @ axis)[:, np.newaxis] * axis
+    rho = np.linalg.norm(radial, axis=1)
+    outward = radial / np.maximum(rho, 1e-9)[:, np.newaxis]
+    axes = np.broadcast_to(axis, outward.shape)
+    frame[on_stem] = np.stack([axes, np.cross(outward, axes), outward], axis=-1)
+    distance[on_stem] = rho - stem.half_width[0]
+    return frame, distance
+
+
+def _correlation(points: FloatArray, errors: FloatArray) -> tuple[float, float]:
+    """Correlation at no distance and reach, cm, of a bell fitted to the products of errors (n,) of neighbours."""
+    if len(points) < 2:
+        return 0.0, 0.0
+    probed = np.unique(np.linspace(0, len(points) - 1, N_PROBED).astype(int))
+    near = cKDTree(points).query_ball_point(points[probed], LONGEST_CM)
+    first = np.repeat(probed, [len(those) for those in near])
+    second = np.concatenate([np.asarray(those, int) for those in near])
+    first, second = first[first != second], second[first != second]
+    lag = (np.linalg.norm(points[first] - points[second], axis=1) / LAG_CM).astype(int)
+    n = int(LONGEST_CM / LAG_CM) + 1
+    count = np.bincount(lag, minlength=n).astype(float)
+    mean = np.bincount(lag, errors[first] * errors[second], n) / np.maximum(count, 1.0) / np.mean(errors**2)
+    middle = (np.arange(n) + 0.5) * LAG_CM
+    best, found = np.inf, (0.0, 0.0)
+    for reach in REACHES_CM:
+        bell = np.exp(-0.5 * (middle / reach) ** 2)
+        square = float(np.sum(count * bell**2))
+        height = float(np.sum(count * bell * mean)) / square
+        misfit = float(np.sum(count * (mean - height * bell) ** 2))
+        if height * np.sqrt(square) > CLEAR and misfit < best:
+            best, found = misfit, (min(height, 1.0), float(reach))
+    return found

@@ -1,0 +1,106 @@
+"""Remarks on a fit in plain words: where its numbers rest on little, or on nothing."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phytofit.likelihood import CloudLikelihood, State
+from phytofit.models import LEAF, Organ
+
+__all__ = ["Sighting", "flags_of", "sighting"]
+
+FloatArray = NDArray[np.float64]
+N_SECTIONS = 20  # of the leaf, of equal area
+SEEN_DENSITY = 0.25  # of the leaf's typical density, from which a section counts as seen
+N_SECTORS = 12  # around the stem
+ROUND = 0.7  # share of them that must be seen
+BASE_SECTIONS = 2  # the leaf's first tenth
+FEW_ON_STEM = 60  # points
+LITTLE_EXPLAINED = 0.1  # share of outliers that is worth a remark
+MUCH_NOISE_CM = 1.0
+EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which the width is not resolved
+BOUNDED = ("stem_diameter", "stem_length", "leaf_angle", "leaf_length", "leaf_width")
+NEAR_BOUND = 1e-6
+TIP_DOUBTFUL = "whether the tip was seen can't be told: the leaf may be longer"
+TIP_NOT_SEEN = "the tip was not seen: the leaf's length follows from its taper, and may be longer"
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What of a phytomer the cloud shows.
+
+    ``sections`` (20,) density of points on sections of the leaf, base to tip, in units of the typical one;
+    ``stem_points`` number of points on the stem; ``sectors`` share of the stem's circumference with points.
+    """
+
+    sections: FloatArray
+    stem_points: float
+    sectors: float
+
+    @property
+    def leaf(self) -> float:
+        """Share of the leaf's area that was seen."""
+        return float(np.mean(self.sections >= SEEN_DENSITY))
+
+
+def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Sighting:
+    """What of the phytomer the cloud shows; scores (n, k) of the points as `state` gives them."""
+    on_stem = scores[:, -2] + state.share[0]
+    on_leaf = 1.0 - on_stem - (scores[:, -1] + state.share[2])
+    pose = likelihood.pose_of(state)
+    points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]  # in the model's frame
+    leaf = likelihood.model.organs(state.x)[1].row(0)
+    place = _area_share(leaf, points)
+    weight = np.where(on_leaf > 0.5, on_leaf, 0.0)
+    found = np.bincount(np.minimum((place * N_SECTIONS).astype(int), N_SECTIONS - 1), weight, N_SECTIONS)
+    typical = np.median(found[found > 0.0]) if np.any(found > 0.0) else 1.0
+    stem_points = points[on_stem > 0.5]
+    angle = np.arctan2(stem_points[:, 1], stem_points[:, 0])
+    sector = np.bincount(((angle + np.pi) / (2 * np.pi) * N_SECTORS).astype(int) % N_SECTORS, minlength=N_SECTORS)
+    shown = np.mean(sector > SEEN_DENSITY * np.quantile(sector, 0.75)) if len(stem_points) else 0.0
+    return Sighting(found / typical, float(on_stem.sum()), float(shown))
+
+
+def _area_share(leaf: Organ, points: FloatArray) -> FloatArray:
+    """Share (n,) of the leaf's area that lies nearer to its base than each point."""
+    assert leaf.kind == LEAF
+    offset = points[:, np.newaxis] - leaf.axis[:-1]
+    along = np.clip(np.einsum("nmi,mi->nm", offset, leaf.frame[:, :, 0]), 0.0, leaf.segment_lengths)
+    gap = offset - along[..., np.newaxis] * leaf.frame[:, :, 0]
+    j = np.argmin(np.einsum("nmi,nmi->nm", gap, gap), axis=1)
+    area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
+    before = np.concatenate([[0.0], np.cumsum(area)])
+    passed = before[j] + along[np.arange(len(points)), j] / leaf.segment_lengths[j] * area[j]
+    share: FloatArray = passed / before[-1]
+    return share
+
+
+def flags_of(likelihood: CloudLikelihood, state: State, seen: Sighting, *, tip_doubtful: bool) -> Iterator[str]:
+    """The remarks on a fit."""
+    space = likelihood.space
+    x = dict(zip(space.names, state.x.tolist(), strict=True))
+    outliers = 100 * state.share[2]
+    if state.seen < 1.0:
+        yield TIP_NOT_SEEN
+    elif tip_doubtful:
+        yield TIP_DOUBTFUL
+    if np.all(seen.sections[:BASE_SECTIONS] < SEEN_DENSITY):
+        yield "the leaf's base is hidden: its angle is read off the rest of the leaf"
+    if seen.leaf < 0.5:
+        yield f"only {100 * seen.leaf:.0f} % of the leaf was seen"
+    if seen.stem_points < FEW_ON_STEM:
+        yield f"only {seen.stem_points:.0f} points on the stem"
+    elif seen.sectors < ROUND:
+        yield f"the stem was seen from one side: its diameter rests on {360 * seen.sectors:.0f}° of its circumference"
+    if state.share[2] >= LITTLE_EXPLAINED:
+        yield f"the model does not explain {outliers:.0f} % of the points"
+    for name, noise in zip(("stem", "leaf"), state.noise, strict=False):
+        if noise > MUCH_NOISE_CM:
+            yield f"the points scatter by {noise:.1f} cm around the {name}: far more than expected"
+    if 0.5 * x["leaf_width"] < EDGE_ON * state.noise[1]:
+        yield "the leaf's width can't be told from the scatter of its points: was it seen edge-on?"
+    for i, name in enumerate(space.names):
+        if name in BOUNDED and min(x[name] - space.lower[i], space.upper[i] - x[name]) < NEAR_BOUND:
+            yield f"{name} lies at its bound, {x[name]:g} {space.units[i]}"

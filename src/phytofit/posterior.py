@@ -1,0 +1,311 @@
+"""The most probable phytomer of a cloud, and how well the cloud determines it."""
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor
+from scipy.spatial import cKDTree
+
+from phytofit.dependence import Dependence, score_dependence
+from phytofit.distances import Reference, quantile_hausdorff
+from phytofit.flags import flags_of, sighting
+from phytofit.likelihood import CloudLikelihood, Evaluation, State
+from phytofit.objectives import PaperObjective, minimise
+from phytofit.optimize import CrossEntropy, Generation, Refined, refine
+from phytofit.species import Species
+
+__all__ = ["Estimate", "estimate"]
+
+FloatArray = NDArray[np.float64]
+COARSE_POINTS = 1000  # that decide which start is the best
+START_NOISE_CM = 2.0  # wide, so that a start some cm off is drawn in
+CUT_SHARE = 0.85  # of the midrib, from which the search for a missing tip starts
+DITHER_CM = 0.1
+N_PROBED = 300  # points around which it is seen whether there is any noise
+TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
+STEP = 0.02  # of a parameter's standard error, for differences of the gradient
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The maximum of the posterior.
+
+    ``x`` (k,) with ``covariance`` (k, k) of its error; ``pose`` (4, 4) from the model's frame to the cloud's;
+    ``noise`` (3,) cm: on the stem, on the leaf, and what the leaf's thickness adds across it; ``share`` (3,) of stem,
+    leaf and outliers; ``seen``: share of the midrib that was seen, 1 unless the tip is missing; ``tip_seen``: whether
+    it clearly is not; ``log_p`` (n,) of the points; ``evidence``: Laplace's approximation of the log probability of
+    the cloud, up to a constant of the cloud; ``inflation``: how many times more the errors vary than those of
+    independent points would; ``correlated_cm``: how far errors of neighbours are correlated, 0 if they are not;
+    ``flags``: remarks in plain words.
+    """
+
+    x: FloatArray
+    covariance: FloatArray
+    pose: FloatArray
+    noise: FloatArray
+    share: FloatArray
+    seen: float
+    tip_seen: bool
+    log_p: FloatArray
+    error: float
+    evidence: float
+    inflation: float
+    correlated_cm: float
+    converged: bool
+    history: tuple[Generation, ...]
+    flags: tuple[str, ...] = ()
+
+
+def estimate(
+    species: Species,
+    points: FloatArray,
+    starts: Sequence[tuple[FloatArray, FloatArray]],
+    *,
+    organ: NDArray[np.int8] | None = None,
+    n_samples: int = 100,
+    n_points: int = 500,
+    n_generations: int = 5,
+    elite_fraction: float = 0.1,
+    covariance_noise: float = 0.5,
+    seed: int = 0,
+    executor: Executor | None = None,
+    progress: Callable[[Generation], None] | None = None,
+) -> Estimate:
+    """Search, then refine: first the paper's model, then the one that real leaves need, and keep what the cloud backs.
+
+    Parameters
+    ----------
+    points : (n, 3) cm, as seen from the first start
+    starts : mean (7,) and pose (4, 4) of the model's frame to begin from, each
+    organ : (n,) 0 stem, 1 leaf, -1 unknown; None: all unknown
+    n_samples, n_points, n_generations : of the cross-entropy search that finds the basin
+    """
+    points = _dithered(points, seed)
+    plain = species.leading(len(starts[0][0]))
+    search = CrossEntropy(
+        plain.space,
+        n_samples=n_samples,
+        n_generations=n_generations,
+        elite_fraction=elite_fraction,
+        covariance_noise=covariance_noise,
+        mean=starts[0][0],
+        seed=seed,
+    )
+    stride = max(1, round(len(points) / n_points))
+    objective = PaperObjective(
+        plain.model,
+        Reference.of(points[::stride], None),
+        starts=[_at_junction(mean, pose) for mean, pose in starts],
+        n_points=n_points,
+        distance=quantile_hausdorff,
+        scout_stride=4,
+        seed=seed,
+        executor=executor,
+    )
+    minimise(search, objective, progress)
+    registration, _ = objective.register(search.mean)
+    begun = [(search.mean, registration.T_target_source), *starts]
+
+    stride = max(1, len(points) // COARSE_POINTS)
+    coarse = CloudLikelihood(
+        plain.model,
+        plain.space,
+        points[::stride],
+        organ=None if organ is None else organ[::stride],
+        weights=np.full(len(points[::stride]), float(stride)),
+    )
+    states = [coarse.start(mean, pose, START_NOISE_CM) for mean, pose in begun]
+    ends = _mapped(executor, partial(_refined, coarse, max_iterations=40), states)
+    best = min(range(len(ends)), key=lambda i: ends[i].error)
+    state = State(ends[best].theta, states[best].pose, states[best].center)
+
+    ends_found = [_end(plain, state, points, organ, executor)]
+    ends_found.append(_end(plain, _cut(ends_found[0].state), points, organ, executor, cut=True))
+    if len(plain.space) < len(species.space):
+        ends_found.append(_end(species, ends_found[0].state, points, organ, executor, thick=True))
+        ends_found.append(_end(species, _cut(ends_found[2].state), points, organ, executor, thick=True, cut=True))
+    dependence = score_dependence(ends_found[-1].likelihood, ends_found[-1].state)  # the richest: least misfit
+    evidence = [_evidence(end, dependence.inflation) for end in ends_found]
+    # how much more probable the cloud is with the tip missing, of the models with and without it, two by two
+    gain = [
+        (ends_found[i | 1].fit_of_points - ends_found[i & ~1].fit_of_points) / dependence.inflation
+        for i in range(len(ends_found))
+    ]
+    backed = [
+        e if i % 2 == 0 or g > TIP_MISSING else -np.inf for i, (e, g) in enumerate(zip(evidence, gain, strict=True))
+    ]
+    best = int(np.argmax(backed))
+    end = ends_found[best]
+    if best < len(ends_found) - 1:
+        dependence = score_dependence(end.likelihood, end.state)
+    doubtful = best % 2 == 0 and gain[best] > TIP_DOUBTFUL
+    return _estimate(end, evidence[best], dependence, tuple(search.history), tip_doubtful=doubtful)
+
+
+class _End(NamedTuple):
+    """Where a refinement ended."""
+
+    likelihood: CloudLikelihood
+    state: State
+    converged: bool
+
+    @property
+    def fit_of_points(self) -> float:
+        """Log probability of the points."""
+        return float(self.likelihood.evaluate(self.state, derivatives=False).log_p.sum())
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which entries of theta were not held fixed."""
+        return self.likelihood.lower < self.likelihood.upper
+
+
+def _end(
+    species: Species,
+    state: State,
+    points: FloatArray,
+    organ: NDArray[np.int8] | None,
+    executor: Executor | None,
+    *,
+    thick: bool = False,
+    cut: bool = False,
+) -> _End:
+    likelihood = CloudLikelihood(
+        species.model, species.space, points, organ=organ, thick=thick, cut=cut, executor=executor
+    )
+    state = likelihood.extended(state)
+    end = _refined(likelihood, state)
+    return _End(likelihood, State(end.theta, state.pose, state.center), end.converged)
+
+
+def _dithered(points: FloatArray, seed: int) -> FloatArray:
+    """The points (n, 3), with a little noise if they have next to none.
+
+    Without noise the scores say nothing of how fast the likelihood falls off, and the refinement gets stuck.
+    """
+    some = points[:: max(1, len(points) // N_PROBED)]
+    near = points[cKDTree(points).query(some, k=min(12, len(points)))[1]]
+    offset = near - near.mean(axis=1, keepdims=True)
+    rough = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", offset, offset) / near.shape[1])[:, 0]
+    if np.sqrt(max(0.0, float(np.median(rough)))) >= 0.5 * DITHER_CM:
+        return points
+    return points + np.random.default_rng(seed).normal(0.0, DITHER_CM, points.shape)
+
+
+def _cut(state: State) -> State:
+    """The state with a longer leaf, of which as much is seen as of the one that it had."""
+    theta = state.theta.copy()
+    theta[[3, 5]] /= CUT_SHARE  # the bend is a thirtieth of the leaf's
+    theta[state.n_parameters] = CUT_SHARE
+    return State(theta, state.pose, state.center)
+
+
+def _at_junction(mean: FloatArray, pose: FloatArray) -> FloatArray:
+    """The start as :class:`PaperObjective` takes it: with the junction of leaf and stem as its origin."""
+    at = pose.copy()
+    at[:3, 3] += pose[:3, 2] * mean[1]
+    return at
+
+
+def _mapped(executor: Executor | None, call: Callable[[State], Refined], states: Iterable[State]) -> list[Refined]:
+    return list(map(call, states) if executor is None else executor.map(call, states))
+
+
+def _refined(likelihood: CloudLikelihood, state: State, max_iterations: int = 60) -> Refined:
+    def evaluate(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        return _terms(likelihood, likelihood.with_theta(state, theta))
+
+    def error_of(theta: FloatArray) -> float:
+        return likelihood.evaluate(likelihood.with_theta(state, theta), derivatives=False).error
+
+    return refine(
+        evaluate,
+        error_of,
+        state.theta,
+        lower=likelihood.lower,
+        upper=likelihood.upper,
+        max_iterations=max_iterations,
+    )
+
+
+def _terms(likelihood: CloudLikelihood, state: State) -> tuple[float, FloatArray, FloatArray]:
+    """Error, gradient (k,), and Fisher information by the scores' outer product, with the prior's (k, k)."""
+    at = likelihood.evaluate(state)
+    weighted = at.scores if likelihood.weights is None else at.scores * likelihood.weights[:, np.newaxis]
+    return at.error, _gradient(likelihood, state, at), at.scores.T @ weighted + np.diag(likelihood.precision)
+
+
+def _gradient(likelihood: CloudLikelihood, state: State, at: Evaluation) -> FloatArray:
+    of_points = at.scores.sum(axis=0) if likelihood.weights is None else likelihood.weights @ at.scores
+    gradient: FloatArray = (state.theta - likelihood.mean) * likelihood.precision - of_points
+    return gradient
+
+
+def _evidence(end: _End, inflation: float) -> float:
+    """Laplace's approximation of the log probability of the cloud under the model, up to a constant of the cloud.
+
+    Points whose errors depend on each other count as `inflation` times fewer.
+    """
+    likelihood, theta, free = end.likelihood, end.state.theta, end.free
+    at = likelihood.evaluate(end.state)
+    precision = likelihood.precision[free]
+    information = (at.scores.T @ at.scores)[np.ix_(free, free)] / inflation + np.diag(precision)
+    surprise = 0.5 * np.sum((theta - likelihood.mean) ** 2 * likelihood.precision)
+    prior = 0.5 * np.sum(np.log(precision[precision > 0.0]))
+    return float(at.log_p.sum() / inflation - surprise + prior - 0.5 * np.linalg.slogdet(information)[1])
+
+
+def _estimate(
+    end: _End, evidence: float, dependence: Dependence, history: tuple[Generation, ...], *, tip_doubtful: bool
+) -> Estimate:
+    likelihood, state, free = end.likelihood, end.state, end.free
+    k = state.n_parameters
+    at = likelihood.evaluate(state)
+    covariance = np.zeros((len(free), len(free)))
+    inverse = np.linalg.inv(_curvature(end, at))
+    variability = (dependence.variability + np.diag(likelihood.precision))[np.ix_(free, free)]
+    covariance[np.ix_(free, free)] = inverse @ variability @ inverse
+    return Estimate(
+        x=state.x.copy(),
+        covariance=covariance[:k, :k],
+        pose=likelihood.pose_of(state),
+        noise=state.noise,
+        share=state.share,
+        seen=state.seen,
+        tip_seen=state.seen == 1.0 and not tip_doubtful,
+        log_p=at.log_p,
+        error=at.error,
+        evidence=evidence,
+        inflation=dependence.inflation,
+        correlated_cm=dependence.reach_cm,
+        converged=end.converged,
+        history=history,
+        flags=tuple(flags_of(likelihood, state, sighting(likelihood, state, at.scores), tip_doubtful=tip_doubtful)),
+    )
+
+
+def _curvature(end: _End, at: Evaluation) -> FloatArray:
+    """Second derivatives of the error by the free entries of theta, by differences of the gradient; the information
+    where they are not positive definite."""
+    likelihood, state, free = end.likelihood, end.state, np.flatnonzero(end.free)
+    gradient = _gradient(likelihood, state, at)[free]
+    information = (at.scores.T @ at.scores + np.diag(likelihood.precision))[np.ix_(free, free)]
+    curvature = np.empty_like(information)
+    for row, i in enumerate(free):
+        step = STEP / np.sqrt(information[row, row])
+        theta = state.theta.copy()
+        theta[i] += step if theta[i] + step <= likelihood.upper[i] else -step
+        moved = likelihood.with_theta(state, theta)
+        change = _gradient(likelihood, moved, likelihood.evaluate(moved))[free] - gradient
+        curvature[row] = change / (theta[i] - state.theta[i])
+    curvature = 0.5 * (curvature + curvature.T)
+    try:
+        cho_factor(curvature)
+    except LinAlgError:
+        return information
+    return curvature

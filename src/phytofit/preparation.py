@@ -1,0 +1,103 @@
+"""Before a fit: the cloud is cleaned, its stem found, and what is left thinned as it looks from there."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phytofit.cloud import PointCloud, remove_outliers, size_cm, thin
+from phytofit.pose import StartPose, start_poses
+from phytofit.species import Species
+
+__all__ = ["Prepared", "prepare"]
+
+FloatArray = NDArray[np.float64]
+CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A cloud ready to be fitted.
+
+    ``used`` is the cloud, without outliers unless they were to be kept, ``kept`` (m,) the indices of its points that
+    are left when it is thinned, ``points`` (m, 3) those as seen from the best start pose, upright, in the prior's cm,
+    ``organ`` (m,) what their labels say (0 stem, 1 leaf, -1 unknown) or None; ``starts`` the start poses in that
+    frame; ``home`` (4, 4) maps it to the cloud's, ``scale`` of whose lengths make a cm.  ``notes`` tell what was left
+    out.
+    """
+
+    used: PointCloud
+    kept: NDArray[np.intp]
+    points: FloatArray
+    organ: NDArray[np.int8] | None
+    starts: list[StartPose]
+    home: FloatArray
+    scale: float
+    notes: tuple[str, ...] = ()
+
+
+def prepare(
+    cloud: PointCloud,
+    species: Species,
+    *,
+    n_points: int = 5000,
+    up: FloatArray | None = None,
+    with_outliers: bool = False,
+) -> Prepared:
+    """Clean a cloud, find where its stem stands, and thin it as it looks from there.
+
+    The stem is looked for without outliers; `with_outliers` keeps them for the fit, in case that it accounts for them.
+    The coordinates are rounded, so that a rotated copy of the cloud gives the same numbers.
+    """
+    clean = used = cloud.take(remove_outliers(cloud.points))
+    if with_outliers:
+        used = cloud
+    scale = size_cm(clean.points) / _expected_size(species) if cloud.unit == "none" else 1.0
+    starts = start_poses(clean.points / scale, _largest_stem_radius(species), up=up)
+    home = starts[0].pose
+    upright = np.round((used.points / scale - home[:3, 3]) @ home[:3, :3], CANONICAL_DECIMALS)
+    kept = thin(upright, n_points)
+    return Prepared(
+        used=used,
+        kept=kept,
+        points=upright[kept],
+        organ=None if used.labels is None else _organ_numbers(used.labels[kept]),
+        starts=[
+            replace(start, pose=np.round(_rigid_inverse(home) @ start.pose, CANONICAL_DECIMALS)) for start in starts
+        ],
+        home=home,
+        scale=scale,
+        notes=tuple(_what_was_left_out(len(cloud), len(used), len(kept))),
+    )
+
+
+def _rigid_inverse(pose: FloatArray) -> FloatArray:
+    inverse = np.eye(4)
+    inverse[:3, :3] = pose[:3, :3].T
+    inverse[:3, 3] = -pose[:3, :3].T @ pose[:3, 3]
+    return inverse
+
+
+def _organ_numbers(labels: NDArray[np.int64]) -> NDArray[np.int8]:
+    """Labels count 0 unknown, 1 stem, 2.. leaves; organs 0 stem, 1 leaf, -1 unknown."""
+    return np.clip(labels - 1, -1, 1).astype(np.int8)
+
+
+def _what_was_left_out(n_read: int, n_clean: int, n_kept: int) -> list[str]:
+    said = []
+    if n_clean < n_read:
+        said.append(f"{n_read - n_clean} of {n_read} points removed as outliers")
+    if n_kept < n_clean:
+        said.append(f"{n_clean} points thinned to {n_kept}")
+    return said
+
+
+def _largest_stem_radius(species: Species) -> float:
+    i = species.space.index("stem_diameter")
+    return float(0.5 * (species.space.mean[i] + 2.0 * species.space.std[i]))
+
+
+def _expected_size(species: Species) -> float:
+    """Size, as :func:`size_cm` takes it, of the phytomer that the prior expects."""
+    nodes = np.concatenate([o.axis[0] for o in species.model.organs(species.space.mean)])
+    return size_cm(nodes)
