@@ -1,4 +1,4 @@
-"""How accurate the fits are; every number that the README and the documentation give comes from here.
+"""How accurate the paper's method is, `--method paper`; the default is measured by trust.py.
 
     python benchmarks/accuracy.py [protocol] [real] [rotations] [--seeds 10] [--phytomers 50]
 
@@ -37,11 +37,11 @@ def simulated_fit(job: tuple[int, int, bool]) -> tuple[np.ndarray, ...]:
     seed, number, stem_above = job
     fixed = None if stem_above else {"stem_length_above": 0.0}
     made = phytofit.simulate(fixed=fixed, seed=100_000 + number)  # 5,000 points, 0.5 cm noise, random orientation
-    result = phytofit.fit(made.points, "cm", seed=seed, stem_above=stem_above, threads=1)
+    result = phytofit.fit(made.points, "cm", seed=seed, stem_above=stem_above, method="paper", threads=1)
     x = np.zeros(7)
     x[: len(result.x)] = result.x
     true = [t.value for t in phytofit.measure(made.organs)]
-    return made.x, x, np.array(true), np.array([t.value for t in result.traits]), np.array(len(result.flags))
+    return made.x[:7], x, np.array(true), np.array([t.value for t in result.traits]), np.array(len(result.flags))
 
 
 def protocol(pool: ProcessPoolExecutor, seeds: int, phytomers: int) -> None:
@@ -86,7 +86,7 @@ def real_fit(job: tuple[Path, int]) -> tuple[dict[str, float], dict[str, float],
     if rotation:
         pose = random_pose(rotation)
         cloud = dataclasses.replace(cloud, points=cloud.points @ pose[:3, :3].T + pose[:3, 3])
-    result = phytofit.fit(cloud, threads=1)
+    result = phytofit.fit(cloud, method="paper", threads=1)
     axes = np.concatenate([organ.axis[:: max(1, len(organ.axis) // 10)] for organ in result.organs])
     back = (axes - pose[:3, 3]) @ pose[:3, :3]
     return {t.name: t.value for t in result.traits}, result.parameters, result.error, result.flags, back

@@ -37,14 +37,14 @@ from peers import Peer, open3d_peer, placed, scipy_peer, small_gicp_peer, yardst
 
 import phytofit
 from phytofit import distances, objectives
-from phytofit.fitting import CANONICAL_DECIMALS, _largest_stem_radius, _mean_at, _rigid_inverse
+from phytofit.fitting import mean_at
 from phytofit.kernels.distance import hausdorff
 from phytofit.kernels.icp import icp, transform
 from phytofit.kernels.nearest import NearestGrid
 from phytofit.simulation import random_pose
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "sodhi2018"
-SPECIES = phytofit.load_species()
+SPECIES = phytofit.load_species().leading(7)
 CORES = os.cpu_count() or 1
 PAPER = {  # Table I: samples, points -> seconds per generation; 8 threads, Intel i7 2.9 GHz
     (100, 1000): 0.67, (100, 5000): 3.61, (100, 10000): 7.98,
@@ -75,14 +75,11 @@ class Task(NamedTuple):
 
 def task_of(points: np.ndarray, n_points: int) -> Task:
     """What `phytofit.fit` does to a cloud (n, 3), cm, before it searches."""
-    points = points[phytofit.remove_outliers(points)]
-    starts = phytofit.start_poses(points, _largest_stem_radius(SPECIES))
-    home = starts[0].pose
-    upright = np.round((points - home[:3, 3]) @ home[:3, :3], CANONICAL_DECIMALS)
+    found = phytofit.prepare(phytofit.from_points(points, "cm"), SPECIES, n_points=n_points)
     return Task(
-        phytofit.Reference.of(upright[phytofit.thin(upright, n_points)]),
-        [np.round(_rigid_inverse(home) @ start.pose, CANONICAL_DECIMALS) for start in starts],
-        _mean_at(starts[0], SPECIES.space),
+        phytofit.Reference.of(found.points),
+        [start.pose for start in found.starts],
+        mean_at(found.starts[0], SPECIES.space),
     )
 
 
@@ -251,7 +248,7 @@ def search(
         theirs += more[0]
         equal += more[1]
         start = time.process_time()
-        phytofit.fit(cloud, "cm", threads=1, **settings)
+        phytofit.fit(cloud, "cm", method="paper", threads=1, **settings)
         amortised.append(1e3 * (time.process_time() - start) / (n_samples * n_generations))
     ratio = median_ms(theirs) / statistics.median(amortised)
     print(f"{peer.name}, {ROUNDS} rounds: {median_ms(theirs):.2f} ms CPU a candidate")
@@ -265,7 +262,7 @@ def search(
         seconds = []
         for _ in range(repeats):
             start = time.perf_counter()
-            result = phytofit.fit(points, "cm", **settings)
+            result = phytofit.fit(points, "cm", method="paper", **settings)
             seconds.append(time.perf_counter() - start)
         print(f"{name:20}{statistics.median(seconds):8.2f} s   error {result.error:.2f} cm  {'; '.join(result.flags)}")
 
@@ -565,7 +562,7 @@ def main() -> None:
         parser.error(f"{', '.join(unknown)}: expected {', '.join(PARTS)}")
     print(machine())
     start = time.perf_counter()
-    phytofit.fit(simulated(1000), "cm", n_samples=20, n_generations=1, n_points=1000)
+    phytofit.fit(simulated(1000), "cm", method="paper", n_samples=20, n_generations=1, n_points=1000)
     print(f"kernels compiled or read in {time.perf_counter() - start:.1f} s")
     if arguments.quick:
         print("--quick: small numbers; neither times nor shares nor goals mean anything")

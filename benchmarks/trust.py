@@ -1,0 +1,219 @@
+"""How far the default method's numbers and intervals can be trusted; prints every number that is claimed of it.
+
+    python benchmarks/trust.py [protocol] [real] [--phytomers 200]
+
+protocol   the paper's simulated phytomers: correlation with the truth, errors beside the Cramer-Rao bound, coverage of
+           the 95 % intervals, also with noise that is correlated along the surface
+real       the paper's clouds in ../shared/data/sodhi2018: values, intervals, hand measures, the authors' parameters
+"""
+
+import argparse
+import csv
+import multiprocessing
+import os
+import sys
+from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thread
+
+import numpy as np
+from accuracy import DATA, HAND, MM, clouds, progress
+from scipy.spatial import cKDTree
+
+import phytofit
+from phytofit.likelihood import CloudLikelihood
+
+SPECIES = phytofit.load_species()
+N_PARAMETERS = 7  # of the simulated phytomers; the others are at their neutral values
+BOUND_SAMPLE = 40_000  # points by which the Cramer-Rao bound is averaged
+FIRST_SEED = 500_000  # not those of accuracy.py
+
+
+class Job(NamedTuple):
+    """One simulated phytomer: its number, the points, the noise, cm, and how far it is correlated, cm."""
+
+    number: int
+    n_points: int = 5000
+    noise_cm: float = 0.5
+    correlated_cm: float = 0.0
+
+
+class Row(NamedTuple):
+    """What became of it; `covered` is NaN where there is no interval."""
+
+    x: np.ndarray
+    fitted: np.ndarray
+    covered_x: np.ndarray
+    traits: np.ndarray
+    measured: np.ndarray
+    covered: np.ndarray
+    bound: np.ndarray
+    flags: tuple[str, ...]
+    n_parameters: int
+
+
+def correlated(points: np.ndarray, noise_cm: float, reach_cm: float, random: np.random.Generator) -> np.ndarray:
+    """The points with noise of which neighbours share most: white noise averaged over `reach_cm` around each point."""
+    white = random.standard_normal(points.shape)
+    smooth = np.array(
+        [white[near].sum(axis=0) / np.sqrt(len(near)) for near in cKDTree(points).query_ball_point(points, reach_cm)]
+    )
+    return points + noise_cm * smooth
+
+
+def fit_simulated(job: Job) -> Row:
+    seed = FIRST_SEED + job.number
+    noise = 0.0 if job.correlated_cm else job.noise_cm
+    made = phytofit.simulate(SPECIES, n_points=job.n_points, noise_cm=noise, seed=seed)
+    points = made.points
+    if job.correlated_cm:
+        points = correlated(points, job.noise_cm, job.correlated_cm, np.random.default_rng(seed))
+    result = phytofit.fit(points, "cm", seed=0, threads=1)
+    truth = phytofit.measure(made.organs)
+    low, high = np.array(list(result.parameter_intervals.values()))[:N_PARAMETERS].T
+    x = made.x[:N_PARAMETERS]
+    return Row(
+        x,
+        result.x[:N_PARAMETERS],
+        (low <= x) & (x <= high),
+        np.array([t.value for t in truth]),
+        np.array([t.value for t in result.traits]),
+        np.array([covers(fitted, true.value) for fitted, true in zip(result.traits, truth, strict=True)]),
+        cramer_rao(made, job) if not job.correlated_cm else np.full(N_PARAMETERS, np.nan),
+        result.flags,
+        len(result.x),
+    )
+
+
+def covers(trait: phytofit.Trait, value: float) -> float:
+    if trait.low is None and trait.high is None:
+        return np.nan
+    return float((trait.low is None or trait.low <= value) and (trait.high is None or value <= trait.high))
+
+
+def cramer_rao(made: phytofit.SimulatedPhytomer, job: Job) -> np.ndarray:
+    """Least standard error (7,) of an unbiased estimate from so many points, pose, noise and shares unknown.
+
+    The Fisher information is the mean of the scores' outer product over many points of the true model.
+    """
+    random = np.random.default_rng(0)
+    points, _ = phytofit.SurfaceSampler(BOUND_SAMPLE, 1).draw(made.organs)
+    points = points + random.normal(0.0, job.noise_cm, points.shape)
+    species = SPECIES.leading(N_PARAMETERS)
+    likelihood = CloudLikelihood(species.model, species.space, points)
+    state = likelihood.start(made.x[:N_PARAMETERS], made.pose, job.noise_cm)
+    theta = state.theta.copy()
+    stem, leaf = (organ.area for organ in made.organs)
+    theta[-5:] = [np.log(job.noise_cm), np.log(job.noise_cm), np.log(0.01), np.log(stem / leaf), -9.0]
+    scores = likelihood.evaluate(likelihood.with_theta(state, theta)).scores
+    keep = [
+        *range(N_PARAMETERS),
+        *range(N_PARAMETERS + 1, N_PARAMETERS + 9),
+        N_PARAMETERS + 10,
+    ]
+    information = scores[:, keep].T @ scores[:, keep] * (job.n_points / BOUND_SAMPLE)
+    return np.sqrt(np.diag(np.linalg.inv(information)))[:N_PARAMETERS]
+
+
+def report(rows: list[Row]) -> None:
+    names = SPECIES.space.names[:N_PARAMETERS]
+    x, fitted, covered, bound = (np.array([getattr(r, f) for r in rows]) for f in ("x", "fitted", "covered_x", "bound"))
+    flagged = np.array([bool(r.flags) for r in rows])
+    print(
+        f"{len(rows)} phytomers, {flagged.sum()} flagged; "
+        f"the paper's model kept in {sum(r.n_parameters <= N_PARAMETERS for r in rows)}"
+    )
+    for flag, number in Counter(flag for r in rows for flag in r.flags).most_common():
+        print(f"  {number:4} {flag}")
+    print(
+        f"{'':22}{'R':>8}{'RMSE':>8}{'bias':>8}{'bound':>8}{'ratio':>7}{'covered':>9}   "
+        "(of all; coverage of the unflagged)"
+    )
+    for k, name in enumerate(names):
+        line(name, x[:, k], fitted[:, k], covered[~flagged, k], np.sqrt(np.mean(bound[:, k] ** 2)))
+    traits, measured, covered = (np.array([getattr(r, f) for r in rows]) for f in ("traits", "measured", "covered"))
+    for k, trait in enumerate(phytofit.measure(phytofit.simulate(SPECIES).organs)):
+        line(trait.name, traits[:, k], measured[:, k], covered[~flagged, k])
+
+
+def line(name: str, true: np.ndarray, fitted: np.ndarray, covered: np.ndarray, bound: float = np.nan) -> None:
+    error = fitted - true
+    rmse = np.sqrt(np.mean(error**2))
+    r = np.corrcoef(true, fitted)[0, 1]
+    ratio = "" if np.isnan(bound) else f"{bound:8.3f}{rmse / bound:7.2f}"
+    print(f"{name:22}{r:8.4f}{rmse:8.3f}{error.mean():8.3f}{ratio:15}{100 * np.nanmean(covered):8.1f} %")
+
+
+def protocol(pool: ProcessPoolExecutor, phytomers: int) -> None:
+    for title, options in (
+        ("The paper's protocol: 5,000 points, 0.5 cm noise", {}),
+        ("The same with noise correlated over 2 cm", {"correlated_cm": 2.0}),
+    ):
+        jobs = [Job(number, **options) for number in range(phytomers)]
+        rows = list(progress(pool.map(fit_simulated, jobs, chunksize=1), len(jobs)))
+        print(f"\n{title}")
+        report(rows)
+
+
+def real(pool: ProcessPoolExecutor) -> None:
+    paths = clouds()
+    results = dict(zip(paths, pool.map(fit_real, paths), strict=True))
+    with (DATA / "greenhouse" / "ground_truth.csv").open() as file:
+        hand = {row["cloud"]: row for row in csv.DictReader(file)}
+    print("\nGreenhouse and field clouds: fitted trait, its interval, hand measure")
+    held, errors = 0, {name: [] for name in HAND}
+    for path in paths:
+        if "simulated" in path.parts:
+            continue
+        result = results[path]
+        print(f"{path.stem}  {'; '.join(result.flags)}")
+        for trait in result.traits:
+            if trait.name not in HAND:
+                continue
+            measure = float(hand[path.stem][HAND[trait.name]]) if path.stem in hand else np.nan
+            if path.stem in hand:
+                held += bool(covers(trait, measure))
+                error = trait.value - measure
+                errors[trait.name].append(abs(error) if trait.unit == "deg" else 100 * abs(error) / measure)
+            print(f"  {trait.name:16}{trait.value:8.2f}{interval(trait):>20}{measure:9.2f}")
+    print(f"hand measures within the interval: {held} of {sum(map(len, errors.values()))}")
+    for name, values in errors.items():
+        print(f"  {name:16} mean absolute error {np.mean(values):5.1f} {'deg' if name == 'leaf_angle' else '%'}")
+    print("\nThe authors' simulated clouds: fitted parameter (theirs)")
+    names = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width")
+    print(f"{'':18}" + "".join(f"{name:>20}" for name in names))
+    for path in paths:
+        if "simulated" in path.parts:
+            theirs = dict(row.split() for row in path.with_suffix(".txt").read_text().splitlines())
+            parameters = results[path].parameters
+            cells = "".join(f"{parameters[n]:11.2f} ({float(theirs[n]):6.2f})" for n in names)
+            print(f"{path.parent.name}/{path.stem:6}{cells}  {'; '.join(results[path].flags)}")
+
+
+def interval(trait: phytofit.Trait) -> str:
+    return " - ".join("" if end is None else f"{end:.2f}" for end in (trait.low, trait.high))
+
+
+def fit_real(path: Path) -> phytofit.Fit:
+    return phytofit.fit(phytofit.read_cloud(path, "mm" if path.stem in MM else "cm"), threads=1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", default=[], help="protocol, real; all by default")
+    parser.add_argument("--phytomers", type=int, default=200)
+    arguments = parser.parse_args()
+    parts = {"protocol": lambda pool: protocol(pool, arguments.phytomers), "real": real}
+    unknown = set(arguments.parts) - set(parts)
+    if unknown:
+        sys.exit(f"no part is called {', '.join(unknown)}; there are {', '.join(parts)}")
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
+        for name in arguments.parts or parts:
+            parts[name](pool)
+
+
+if __name__ == "__main__":
+    main()
