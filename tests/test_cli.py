@@ -251,7 +251,7 @@ def test_recipe_prints_every_setting_as_json():
     assert recipe["fit"]["n_points"] == 5000
     assert recipe["method_paper"]["n_samples"] == 500
     assert recipe["method_paper"]["n_generations"] == 10
-    assert recipe["method_likelihood"]["n_samples"] == 100
+    assert recipe["method_likelihood"]["n_samples"] == 60
     assert recipe["fit"]["elite_fraction"] == 0.1
     assert recipe["objective"]["tilts_deg"]
 

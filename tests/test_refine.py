@@ -107,7 +107,7 @@ def test_at_the_minimum_it_stays():
     np.testing.assert_array_equal(end.theta, solution)
 
 
-@given(st.floats(0.5, 6.0), st.floats(0.1, 2.5), st.floats(-2.0, 3.0))
+@given(st.floats(1.0, 6.0), st.floats(0.3, 1.5), st.floats(-1.0, 2.0))
 def test_an_exponential_as_scipy_fits_it(amplitude, rate, offset):
     problem = decay()
     start = np.array([amplitude, rate, offset])

@@ -16,7 +16,7 @@ __all__ = ["Dependence", "score_dependence"]
 FloatArray = NDArray[np.float64]
 SHIFT = 0.3  # of the noise: by so much points are moved to see how their scores change
 SURE = 0.9  # probability of its organ, of a point whose error is looked at
-N_PROBED = 400  # points whose neighbours' errors are compared with theirs
+N_PROBED = 250  # points whose neighbours' errors are compared with theirs
 LAG_CM = 0.25  # width of the distance classes for that
 LONGEST_CM = 10.0
 REACHES_CM = np.geomspace(0.2, 6.0, 30)
@@ -77,7 +77,8 @@ def score_dependence(likelihood: CloudLikelihood, state: State) -> Dependence:
         sums = np.stack([np.bincount(number, column) for column in change.T], axis=1)
         cross = sums.T @ (weight @ sums)
         extra += sums.T @ sums - change.T @ change + cross + cross.T
-    variability = independent + correlation * extra
+    values, vectors = np.linalg.eigh(extra)  # a bell that is cut off is not quite positive
+    variability = independent + correlation * (vectors * np.maximum(values, 0.0)) @ vectors.T
     factor = cho_factor(independent + np.diag(likelihood.precision + 1e-9))
     inflation = float(np.trace(cho_solve(factor, variability + np.diag(likelihood.precision)))) / len(independent)
     return Dependence(variability, max(1.0, inflation), reach, correlation)
@@ -125,12 +126,15 @@ def _correlation(points: FloatArray, errors: FloatArray) -> tuple[float, float]:
     count = np.bincount(lag, minlength=n).astype(float)
     mean = np.bincount(lag, errors[first] * errors[second], n) / np.maximum(count, 1.0) / np.mean(errors**2)
     middle = (np.arange(n) + 0.5) * LAG_CM
+    twice = 2.0 if len(probed) == len(points) else 1.0  # each pair was met twice
     best, found = np.inf, (0.0, 0.0)
     for reach in REACHES_CM:
         bell = np.exp(-0.5 * (middle / reach) ** 2)
         square = float(np.sum(count * bell**2))
+        if square == 0.0:
+            continue
         height = float(np.sum(count * bell * mean)) / square
         misfit = float(np.sum(count * (mean - height * bell) ** 2))
-        if height * np.sqrt(square) > CLEAR and misfit < best:
+        if height * np.sqrt(square / twice) > CLEAR and misfit < best:
             best, found = misfit, (min(height, 1.0), float(reach))
     return found

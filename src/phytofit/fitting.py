@@ -199,7 +199,7 @@ def fit(
         al., IROS 2018, for the least distance between the clouds
     distance : what the paper's method minimises: hausdorff (its own), quantile, chamfer, labels
     n_samples, n_generations : of the cross-entropy search: 500 candidates in each of 10 generations for "paper",
-        100 in each of 5 for "likelihood", which is refined afterwards
+        60 in each of 4 for "likelihood", which is refined afterwards
     n_points : to which the cloud is thinned; for "paper" also of each candidate
     elite_fraction, covariance_noise : see :class:`phytofit.CrossEntropy`
     random_start : start the search from means drawn from the prior (as in Fig. 7d), not from the prior's and, for
@@ -325,8 +325,8 @@ def fit_likelihood(
     seed: int,
     executor: Executor,
     progress: Callable[[Generation], None] | None,
-    n_samples: int = 100,
-    n_generations: int = 5,
+    n_samples: int = 60,
+    n_generations: int = 4,
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
 ) -> Fit:

@@ -13,7 +13,7 @@ from phytofit.kernels.likelihood import LEAF_COLUMNS, STEM_COLUMNS, log_density
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
 
-__all__ = ["CloudLikelihood", "Evaluation", "State"]
+__all__ = ["THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 
 FloatArray = NDArray[np.float64]
 N_EXTRA = 12  # entries of theta after the model's parameters, see State

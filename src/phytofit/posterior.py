@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from phytofit.dependence import Dependence, score_dependence
 from phytofit.distances import Reference, quantile_hausdorff
 from phytofit.flags import flags_of, sighting
-from phytofit.likelihood import CloudLikelihood, Evaluation, State
+from phytofit.likelihood import THICKNESS, CloudLikelihood, Evaluation, State
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
 from phytofit.species import Species
@@ -22,12 +22,14 @@ from phytofit.species import Species
 __all__ = ["Estimate", "estimate"]
 
 FloatArray = NDArray[np.float64]
-COARSE_POINTS = 1000  # that decide which start is the best
+COARSE_POINTS = 700  # that decide which start is the best
 START_NOISE_CM = 2.0  # wide, so that a start some cm off is drawn in
 CUT_SHARE = 0.85  # of the midrib, from which the search for a missing tip starts
 DITHER_CM = 0.1
 N_PROBED = 300  # points around which it is seen whether there is any noise
+SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its ten parameters gain five by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
+LEAST_LEFT = 1.0 / 3.0  # of the residuals' degrees of freedom
 STEP = 0.02  # of a parameter's standard error, for differences of the gradient
 
 
@@ -67,9 +69,9 @@ def estimate(
     starts: Sequence[tuple[FloatArray, FloatArray]],
     *,
     organ: NDArray[np.int8] | None = None,
-    n_samples: int = 100,
-    n_points: int = 500,
-    n_generations: int = 5,
+    n_samples: int = 60,
+    n_points: int = 300,
+    n_generations: int = 4,
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
     seed: int = 0,
@@ -104,6 +106,7 @@ def estimate(
         n_points=n_points,
         distance=quantile_hausdorff,
         scout_stride=4,
+        tilts_deg=(),
         seed=seed,
         executor=executor,
     )
@@ -120,30 +123,32 @@ def estimate(
         weights=np.full(len(points[::stride]), float(stride)),
     )
     states = [coarse.start(mean, pose, START_NOISE_CM) for mean, pose in begun]
-    ends = _mapped(executor, partial(_refined, coarse, max_iterations=40), states)
+    ends = _mapped(executor, partial(_refined, coarse, max_iterations=30), states)
     best = min(range(len(ends)), key=lambda i: ends[i].error)
     state = State(ends[best].theta, states[best].pose, states[best].center)
 
-    ends_found = [_end(plain, state, points, organ, executor)]
-    ends_found.append(_end(plain, _cut(ends_found[0].state), points, organ, executor, cut=True))
+    found = [_end(plain, state, points, organ, executor)]
+    found.append(_end(plain, _cut(found[0].state), points, organ, executor, cut=True))
+    gain = found[1].fit_of_points - found[0].fit_of_points
     if len(plain.space) < len(species.space):
-        ends_found.append(_end(species, ends_found[0].state, points, organ, executor, thick=True))
-        ends_found.append(_end(species, _cut(ends_found[2].state), points, organ, executor, thick=True, cut=True))
-    dependence = score_dependence(ends_found[-1].likelihood, ends_found[-1].state)  # the richest: least misfit
-    evidence = [_evidence(end, dependence.inflation) for end in ends_found]
-    # how much more probable the cloud is with the tip missing, of the models with and without it, two by two
-    gain = [
-        (ends_found[i | 1].fit_of_points - ends_found[i & ~1].fit_of_points) / dependence.inflation
-        for i in range(len(ends_found))
+        simple = found[1] if gain > TIP_MISSING else found[0]
+        if _promise(species, simple, points, organ, executor) > SHAPE_PROMISE:
+            found.append(_end(species, found[0].state, points, organ, executor, thick=True))
+            found.append(_end(species, _cut(found[2].state), points, organ, executor, thick=True, cut=True))
+    dependence = score_dependence(found[-1].likelihood, found[-1].state)  # the richest: least misfit
+    evidence = [_evidence(end, dependence.inflation) for end in found]
+    # how much more probable the points are with the tip missing, of the models with and without it, two by two
+    gains = [
+        (found[i | 1].fit_of_points - found[i & ~1].fit_of_points) / dependence.inflation for i in range(len(found))
     ]
     backed = [
-        e if i % 2 == 0 or g > TIP_MISSING else -np.inf for i, (e, g) in enumerate(zip(evidence, gain, strict=True))
+        e if i % 2 == 0 or g > TIP_MISSING else -np.inf for i, (e, g) in enumerate(zip(evidence, gains, strict=True))
     ]
     best = int(np.argmax(backed))
-    end = ends_found[best]
-    if best < len(ends_found) - 1:
+    end = found[best]
+    if best < len(found) - 1:
         dependence = score_dependence(end.likelihood, end.state)
-    doubtful = best % 2 == 0 and gain[best] > TIP_DOUBTFUL
+    doubtful = best % 2 == 0 and gains[best] > TIP_DOUBTFUL
     return _estimate(end, evidence[best], dependence, tuple(search.history), tip_doubtful=doubtful)
 
 
@@ -195,6 +200,22 @@ def _dithered(points: FloatArray, seed: int) -> FloatArray:
     if np.sqrt(max(0.0, float(np.median(rough)))) >= 0.5 * DITHER_CM:
         return points
     return points + np.random.default_rng(seed).normal(0.0, DITHER_CM, points.shape)
+
+
+def _promise(
+    species: Species,
+    end: _End,
+    points: FloatArray,
+    organ: NDArray[np.int8] | None,
+    executor: Executor | None,
+) -> float:
+    """Log probability that a richer leaf is expected to gain over the fitted one, by Rao's score test."""
+    likelihood = CloudLikelihood(species.model, species.space, points, organ=organ, cut=True, executor=executor)
+    state = likelihood.extended(end.state)
+    state.theta[THICKNESS] = end.state.theta[THICKNESS]
+    _, gradient, information = _terms(likelihood, state)
+    free = np.arange(len(gradient)) != state.n_parameters  # the tip is another question
+    return 0.5 * float(gradient[free] @ np.linalg.solve(information[np.ix_(free, free)], gradient[free]))
 
 
 def _cut(state: State) -> State:
@@ -269,7 +290,9 @@ def _estimate(
     covariance = np.zeros((len(free), len(free)))
     inverse = np.linalg.inv(_curvature(end, at))
     variability = (dependence.variability + np.diag(likelihood.precision))[np.ix_(free, free)]
-    covariance[np.ix_(free, free)] = inverse @ variability @ inverse
+    covariance[np.ix_(free, free)] = (
+        inverse @ variability @ inverse * _small_sample(len(likelihood.points) / dependence.inflation, int(free.sum()))
+    )
     return Estimate(
         x=state.x.copy(),
         covariance=covariance[:k, :k],
@@ -287,6 +310,11 @@ def _estimate(
         history=history,
         flags=tuple(flags_of(likelihood, state, sighting(likelihood, state, at.scores), tip_doubtful=tip_doubtful)),
     )
+
+
+def _small_sample(n_independent: float, k: int) -> float:
+    """By how much errors vary more than the residuals of a fit of k parameters, which has taken some of them up."""
+    return n_independent / max(n_independent - k, LEAST_LEFT * n_independent)
 
 
 def _curvature(end: _End, at: Evaluation) -> FloatArray:

@@ -10,7 +10,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 __all__ = ["Refined", "refine"]
 
 FloatArray = NDArray[np.float64]
-MOST_DAMPING = 1e8  # times the information: steps are then as good as none
+LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6  # times the information: steps are as good as full, or as none
 
 
 @dataclass(frozen=True)
@@ -51,23 +51,31 @@ def refine(
     for iteration in range(1, max_iterations + 1):
         free = ~(((theta <= lower) & (gradient > 0.0)) | ((theta >= upper) & (gradient < 0.0)))
         diagonal = np.diag(information)[free]
-        hoped = 0.0
+        hoped = None  # by how much the error is expected to fall in a step that is not damped
         while True:
-            step = np.zeros_like(theta)
-            damped = (information + missing)[np.ix_(free, free)] + np.diag(damping * diagonal + 1e-9)
+            damped = (information + missing)[np.ix_(free, free)] + np.diag(
+                (damping if hoped is not None else LEAST_DAMPING) * diagonal + 1e-9
+            )
             try:
-                step[free] = -cho_solve(cho_factor(damped), gradient[free])
+                factor = cho_factor(damped)
             except LinAlgError:
                 missing[:] = 0.0
+                damping *= 5.0
                 continue
-            expected = -0.5 * float(gradient @ step)
-            hoped = max(hoped, expected)
-            if expected < tolerance or damping > MOST_DAMPING:
+            step = np.zeros_like(theta)
+            step[free] = -cho_solve(factor, gradient[free])
+            if hoped is None:
+                hoped = -0.5 * float(gradient @ step)
+                if hoped < tolerance:
+                    return Refined(theta, error, iteration, True)
+                if damping > LEAST_DAMPING:
+                    continue
+            if damping > MOST_DAMPING:
                 return Refined(theta, error, iteration, hoped < kink)
             tried = np.clip(theta + step, lower, upper)
             now = error_of(tried)
             if now < error:
-                damping = max(0.2 * damping, 1e-6)
+                damping = max(0.2 * damping, LEAST_DAMPING)
                 break
             damping *= 5.0
         moved = tried - theta

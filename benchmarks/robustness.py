@@ -1,0 +1,243 @@
+"""Where the default method stops working, and whether its flags say so first.
+
+    python benchmarks/robustness.py [field] [sweeps] [--phytomers 20]
+
+field    the paper's two data sets (Fig. 7): a field phytomer with 0.5 cm noise added, or without the points in a
+         sphere of 6 cm; 50 copies each, from random starting means: leaf length beside that of the untouched cloud
+sweeps   simulated phytomers made worse step by step: noise, holes, a missing tip, outliers, one viewpoint, few points;
+         errors, coverage of the 95 % intervals and flags; plotted in docs/images/robustness.png
+"""
+
+import argparse
+import multiprocessing
+import os
+import sys
+from collections import defaultdict
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thread
+
+import numpy as np
+from accuracy import DATA, progress
+from matplotlib.figure import Figure
+from trust import covers
+
+import phytofit
+
+PICTURE = Path(__file__).parents[1] / "docs" / "images" / "robustness.png"
+SPECIES = phytofit.load_species()
+TRAITS = ("leaf_length", "leaf_angle", "leaf_width", "stem_diameter")
+FIRST_SEED = 900_000
+COPIES = 50  # of the field phytomer, each way
+
+
+class Sweep(NamedTuple):
+    """One way of making a cloud worse: its unit, its steps, and points (n, 3) of a phytomer at a step."""
+
+    unit: str
+    steps: tuple[float, ...]
+    cloud: Callable[[phytofit.SimulatedPhytomer, float, np.random.Generator], np.ndarray]
+    noise_cm: float = 0.5
+    n_points: int = 5000
+
+
+class Outcome(NamedTuple):
+    """Errors and coverage (4,) of `TRAITS`, NaN where there is none; flags; False if no phytomer was found."""
+
+    error: np.ndarray
+    covered: np.ndarray
+    flags: tuple[str, ...]
+    found: bool
+
+
+def along_leaf(made: phytofit.SimulatedPhytomer) -> np.ndarray:
+    """Share of the midrib at which each point lies; negative on the stem."""
+    leaf = made.organs[1]
+    offset = made.points[:, np.newaxis] - leaf.axis[:-1]
+    along = np.clip(np.einsum("nmi,mi->nm", offset, leaf.frame[:, :, 0]), 0.0, leaf.segment_lengths)
+    gap = offset - along[..., np.newaxis] * leaf.frame[:, :, 0]
+    j = np.argmin(np.einsum("nmi,nmi->nm", gap, gap), axis=1)
+    share = (j + along[np.arange(len(j)), j] / leaf.segment_lengths[j]) / len(leaf.segment_lengths)
+    return np.where(made.labels == 2, share, -1.0)
+
+
+def with_noise(made: phytofit.SimulatedPhytomer, std_cm: float, random: np.random.Generator) -> np.ndarray:
+    return phytofit.add_noise(made.points, std_cm, random)
+
+
+def with_holes(made: phytofit.SimulatedPhytomer, share: float, random: np.random.Generator) -> np.ndarray:
+    """Without spheres of 6 cm around points of the leaf, but its tip, until so much of the leaf is gone."""
+    place, keep = along_leaf(made), np.ones(len(made.points), bool)
+    leaf = made.labels == 2
+    while keep[leaf].mean() > 1.0 - share:
+        left = np.flatnonzero(keep & leaf & (place < 0.85))
+        if len(left) == 0:
+            break
+        center = made.points[random.choice(left)]
+        keep &= (np.linalg.norm(made.points - center, axis=1) > 3.0) | (place > 0.95)
+    return made.points[keep]
+
+
+def without_tip(made: phytofit.SimulatedPhytomer, share: float, random: np.random.Generator) -> np.ndarray:
+    return made.points[along_leaf(made) < 1.0 - share]
+
+
+def with_outliers(made: phytofit.SimulatedPhytomer, share: float, random: np.random.Generator) -> np.ndarray:
+    """So large a share of all points is outliers."""
+    return np.concatenate([made.points, phytofit.add_outliers(made.points, share / (1.0 - share), random)])
+
+
+def from_one_side(made: phytofit.SimulatedPhytomer, views: float, random: np.random.Generator) -> np.ndarray:
+    """As seen from so many cameras: each sees the near half of the stem, and the leaf but for what the stem hides."""
+    points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    radius = made.organs[0].half_width[0]
+    turn = random.uniform(0.0, 2.0 * np.pi)
+    seen = np.zeros(len(points), bool)
+    for view in range(int(views)):
+        angle = turn + 2.0 * np.pi * view / views
+        toward, across = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
+        depth, side = points @ toward, points @ across
+        behind = (np.abs(side) < radius) & (depth < 0.0) & (points[:, 2] > 0.0)
+        seen |= np.where(made.labels == 1, depth > 0.0, ~behind)
+    return made.points[seen]
+
+
+def fewer(made: phytofit.SimulatedPhytomer, n_points: float, random: np.random.Generator) -> np.ndarray:
+    return made.points[random.permutation(len(made.points))[: int(n_points)]]
+
+
+SWEEPS = {
+    "noise": Sweep("cm", (0.1, 0.25, 0.5, 1.0, 1.5, 2.0), with_noise, noise_cm=0.0),
+    "leaf removed": Sweep("share", (0.0, 0.1, 0.2, 0.4, 0.6), with_holes),
+    "tip cut off": Sweep("share of the midrib", (0.0, 0.05, 0.1, 0.2, 0.3), without_tip),
+    "outliers": Sweep("share of the points", (0.0, 0.1, 0.2, 0.3, 0.4), with_outliers),
+    "views": Sweep("cameras around the plant", (1.0, 2.0, 3.0, 6.0), from_one_side),
+    "points": Sweep("number", (300.0, 1000.0, 2500.0, 5000.0), fewer),
+}
+
+
+def measured(job: tuple[str, float, int]) -> Outcome:
+    name, step, number = job
+    sweep = SWEEPS[name]
+    made = phytofit.simulate(SPECIES, n_points=sweep.n_points, noise_cm=sweep.noise_cm, seed=FIRST_SEED + number)
+    points = sweep.cloud(made, step, np.random.default_rng(number))
+    true = {t.name: t.value for t in phytofit.measure(made.organs)}
+    try:
+        result = phytofit.fit(points, "cm", threads=1)
+    except phytofit.NoPhytomerError as refused:
+        return Outcome(np.full(len(TRAITS), np.nan), np.full(len(TRAITS), np.nan), (str(refused),), False)
+    traits = {t.name: t for t in result.traits}
+    return Outcome(
+        np.array([traits[name].value - true[name] for name in TRAITS]),
+        np.array([covers(traits[name], true[name]) for name in TRAITS]),
+        result.flags,
+        True,
+    )
+
+
+def sweeps(pool: ProcessPoolExecutor, phytomers: int) -> None:
+    jobs = [(name, step, i) for name, sweep in SWEEPS.items() for step in sweep.steps for i in range(phytomers)]
+    outcomes = defaultdict(list)
+    for job, outcome in zip(jobs, progress(pool.map(measured, jobs, chunksize=1), len(jobs)), strict=True):
+        outcomes[job[:2]].append(outcome)
+    print(
+        f"\n{phytomers} simulated phytomers a step: median absolute error (95th percentile) of those that were found;"
+    )
+    print("coverage of the 95 % intervals over the four traits: of all, of the unflagged")
+    figure = Figure(figsize=(13.0, 7.0), layout="constrained")
+    for ax, (name, sweep) in zip(figure.subplots(2, 3).ravel(), SWEEPS.items(), strict=True):
+        print(f"\n{name}, {sweep.unit}")
+        print(f"{'':>8}" + "".join(f"{trait:>18}" for trait in TRAITS) + "   covered  unflagged   flagged  refused")
+        shown = []
+        for step in sweep.steps:
+            those = outcomes[name, step]
+            errors = np.abs([o.error for o in those if o.found]).reshape(-1, len(TRAITS))
+            covered = np.array([o.covered for o in those if o.found]).reshape(-1, len(TRAITS))
+            plain = np.array([o.covered for o in those if o.found and not o.flags]).reshape(-1, len(TRAITS))
+            flagged = np.mean([bool(o.flags) for o in those])
+            refused = sum(not o.found for o in those)
+            median, most = (np.quantile(errors, q, axis=0) if len(errors) else np.full(4, np.nan) for q in (0.5, 0.95))
+            cells = "".join(f"{a:9.2f} ({b:6.2f})" for a, b in zip(median, most, strict=True))
+            held = [100 * np.nanmean(c) if len(c) else np.nan for c in (covered, plain)]
+            print(f"{step:8g}{cells}{held[0]:8.0f} %{held[1]:9.0f} %{100 * flagged:8.0f} %{refused:9}", flush=True)
+            shown.append((median[0], held[0], 100 * flagged))
+        draw(ax, name, sweep, np.array(shown))
+    PICTURE.parent.mkdir(exist_ok=True)
+    figure.savefig(PICTURE, dpi=110)
+    print(f"\nplotted: {PICTURE.relative_to(PICTURE.parents[2])}")
+
+
+def draw(ax, name: str, sweep: Sweep, shown: np.ndarray) -> None:  # type: ignore[no-untyped-def]
+    x = np.arange(len(sweep.steps))
+    ax.plot(x, shown[:, 0], color="#0072B2", marker="o", label="leaf length: median absolute error, cm")
+    ax.set_xticks(x, [f"{step:g}" for step in sweep.steps])
+    ax.set_xlabel(f"{name} ({sweep.unit})")
+    ax.set_ylabel("error, cm")
+    ax.set_ylim(bottom=0.0)
+    ax.grid(alpha=0.25)
+    other = ax.twinx()
+    other.plot(x, shown[:, 1], color="#D55E00", marker="s", ls="--", label="true value within the interval, %")
+    other.plot(x, shown[:, 2], color="#009E73", marker="^", ls=":", label="flagged, %")
+    other.set_ylim(-3.0, 103.0)
+    other.set_ylabel("%")
+    if name == "noise":
+        lines = [*ax.get_lines(), *other.get_lines()]
+        ax.legend(lines, [line.get_label() for line in lines], fontsize=8, loc="center left")
+
+
+def field_length(job: tuple[str, int]) -> tuple[float, float, float, bool, float]:
+    """Leaf length and its interval, whether its tip is said to be missing, and how far the sphere was from the tip."""
+    how, number = job
+    cloud = phytofit.read_cloud(sorted((DATA / "field").glob("*.ply"))[0], "cm")
+    points, away = cloud.points, np.inf
+    random = np.random.default_rng(number)
+    if how == "noise":
+        points = phytofit.add_noise(points, 0.5, random)
+    elif how == "sphere":
+        center = points[np.random.default_rng(number).integers(len(points))]
+        points = points[phytofit.occlude(points, 6.0, random)]
+        tip = phytofit.fit(cloud, threads=1).organs[1].axis[-1]
+        away = float(np.linalg.norm(center - tip))
+    result = phytofit.fit(points, "cm", random_start=how != "untouched", seed=number, threads=1)
+    length = next(t for t in result.traits if t.name == "leaf_length")
+    high = np.inf if length.high is None else length.high
+    return length.value, length.low, high, not result.estimate.tip_seen, away
+
+
+def field(pool: ProcessPoolExecutor) -> None:
+    if not DATA.is_dir():
+        sys.exit(f"{DATA} is absent: the field phytomer can't be measured")
+    untouched = field_length(("untouched", 0))[0]
+    print(f"\nThe paper's corrupted field phytomers (Fig. 7); leaf length of the untouched cloud {untouched:.2f} cm")
+    for how in ("noise", "sphere"):
+        jobs = [(how, number) for number in range(1, COPIES + 1)]
+        value, low, high, tip, away = np.array(list(progress(pool.map(field_length, jobs), COPIES))).T
+        kept = away > 3.0 + 1.0  # cm: the sphere's radius, and some: it took nothing of the tip
+        off = np.abs(value - untouched)
+        held = np.mean((low <= untouched) & (untouched <= high))
+        print(
+            f"  {how:7} {COPIES} copies, {kept.sum()} with the tip: within 1 cm {np.sum(off[kept] <= 1.0)}, "
+            f"median {np.median(off[kept]):.2f} cm off, at most {off[kept].max():.2f}; "
+            f"interval holds it for {100 * held:.0f} % of all; tip said to be missing or doubtful for {int(tip.sum())}"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="*", default=[], help="field, sweeps; both by default")
+    parser.add_argument("--phytomers", type=int, default=20)
+    arguments = parser.parse_args()
+    parts = {"field": field, "sweeps": lambda pool: sweeps(pool, arguments.phytomers)}
+    unknown = set(arguments.parts) - set(parts)
+    if unknown:
+        sys.exit(f"no part is called {', '.join(unknown)}; there are {', '.join(parts)}")
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
+        for name in arguments.parts or parts:
+            parts[name](pool)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,213 @@
+"""Dependence of neighbours' errors: none where there is none, and what there is as simulations of it have it."""
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from scipy.spatial.transform import Rotation
+
+from phytofit.dependence import _correlation, score_dependence
+from phytofit.likelihood import CloudLikelihood, State
+from phytofit.models import SurfaceSampler, move
+from phytofit.species import load_species
+
+SAME = 1e-9  # relative; sums in float64
+REACH = 0.4  # relative; what a few hundred points tell of a correlation's reach
+HEIGHT = 0.25  # the same of its height
+FACTOR = 1.4  # of an inflation: of both its estimate and the simulations that it is held against
+INDEFINITE = 0.1  # of the variance of independent points: the bell is cut off where it is 0.04
+CELLS = 0.15  # relative; neighbours are counted by cells that stay where they are when the cloud is turned
+
+SPECIES = load_species()
+X = np.array([3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0])
+NOISE_CM = 0.3
+
+
+def smooth_noise(places, width_cm, share, random):
+    """Normal errors (n, 3) of variance 1, a share of it white noise averaged over the places' neighbours.
+
+    White noise that a bell of some width has averaged is correlated over a bell that is wider by the root of 2.
+    """
+    white = random.normal(size=places.shape)
+    weight = np.exp(-0.5 * (cdist(places, places) / width_cm) ** 2)
+    weight /= np.linalg.norm(weight, axis=1, keepdims=True)
+    return np.sqrt(share) * weight @ random.normal(size=places.shape) + np.sqrt(1.0 - share) * white
+
+
+def scene(seed, *, n=600, k=7, width_cm=1.0, share=0.0):
+    """The likelihood of a cloud of the phytomer X, whose errors are averages by `share`, and its true state."""
+    random = np.random.default_rng(seed)
+    species = SPECIES.leading(k)
+    stem, leaf = organs = [organ.row(0) for organ in species.model.organs(X[:k])]
+    points, _ = SurfaceSampler(n, seed, even=False).draw(organs)
+    errors = smooth_noise(points, width_cm, share, random) if share else random.normal(size=points.shape)
+    likelihood = CloudLikelihood(species.model, species.space, points + NOISE_CM * errors)
+    state = likelihood.start(X[:k], np.eye(4), NOISE_CM)
+    state.theta[-2:] = np.log(stem.area / leaf.area), np.log(0.01)
+    return likelihood, state
+
+
+def in_standard_errors(likelihood, state, variability):
+    """A covariance (k, k) of the scores' sum, with the prior's, in units of that of independent points."""
+    scores = likelihood.evaluate(state).scores
+    root = np.linalg.cholesky(scores.T @ scores + np.diag(likelihood.precision + 1e-9))
+    whole = variability + np.diag(likelihood.precision)
+    return np.linalg.solve(root, np.linalg.solve(root, whole).T)
+
+
+# a cloud
+
+
+@pytest.mark.parametrize("k", [7, 17])
+@pytest.mark.parametrize("seed", range(4))
+def test_independent_errors_inflate_nothing(seed, k):
+    likelihood, state = scene(seed, k=k)
+    found = score_dependence(likelihood, state)
+    assert (found.inflation, found.reach_cm, found.correlation) == (1.0, 0.0, 0.0)
+    scores = likelihood.evaluate(state).scores
+    np.testing.assert_allclose(found.variability, scores.T @ scores, rtol=SAME)
+
+
+@pytest.mark.parametrize(("seed", "k"), [(1, 7), (2, 7), (3, 7), (2, 17)])
+def test_errors_of_neighbours_are_found_to_be_correlated(seed, k):
+    likelihood, state = scene(seed, n=800, k=k, width_cm=1.0, share=1.0)
+    found = score_dependence(likelihood, state)
+    assert found.reach_cm == pytest.approx(np.sqrt(2.0), rel=REACH)
+    assert found.correlation == pytest.approx(1.0, abs=HEIGHT)
+    assert found.inflation > 2.0
+
+
+def test_the_inflation_is_that_of_many_clouds():
+    """Of clouds of one phytomer: so many times more do sums of scores vary than those of independent points."""
+    sums, estimates, independent = [], [], 0.0
+    for seed in range(100, 200):
+        likelihood, state = scene(seed, n=300, width_cm=1.0, share=1.0)
+        scores = likelihood.evaluate(state).scores
+        sums.append(scores.sum(axis=0))
+        independent += scores.T @ scores / 100.0
+        if seed % 10 == 0:
+            estimates.append(score_dependence(likelihood, state).inflation)
+    prior = np.diag(likelihood.precision)
+    varied = np.linalg.solve(independent + prior + 1e-9 * np.eye(len(prior)), np.cov(np.transpose(sums)) + prior)
+    inflation = np.trace(varied) / len(prior)
+    assert inflation > 2.0
+    assert inflation / FACTOR < np.mean(estimates) < inflation * FACTOR
+
+
+def test_more_and_wider_correlation_inflates_more():
+    settings = [(0.5, 0.5), (0.5, 1.0), (1.0, 1.0), (2.0, 1.0)]
+    found = [score_dependence(*scene(2, width_cm=width, share=share)).inflation for width, share in settings]
+    assert np.all(np.diff(found) > 0.0)
+
+
+def test_twice_the_points_of_the_same_places_know_little_more():
+    """Within a correlated patch, points repeat each other: the variance grows as their square."""
+    few, many = (score_dependence(*scene(5, n=n, width_cm=1.0, share=1.0)) for n in (400, 800))
+    assert 1.4 < many.inflation / few.inflation < 2.8
+
+
+@pytest.mark.parametrize("k", [7, 17])
+@pytest.mark.parametrize("share", [0.5, 1.0])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_variability_is_a_covariance(seed, share, k):
+    """Symmetric, and no combination of parameters has a negative variance to speak of."""
+    likelihood, state = scene(seed, k=k, width_cm=1.0, share=share)
+    found = score_dependence(likelihood, state)
+    assert found.inflation > 1.0
+    whole = in_standard_errors(likelihood, state, found.variability)
+    np.testing.assert_allclose(whole, whole.T, atol=SAME * np.abs(whole).max())
+    values = np.linalg.eigvalsh(whole)
+    assert values[0] > -INDEFINITE
+    assert values.mean() == pytest.approx(found.inflation, rel=1e-6)
+
+
+def test_a_cloud_may_lie_anywhere():
+    likelihood, state = scene(2, width_cm=1.0, share=1.0)
+    there = np.eye(4)
+    there[:3, :3] = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
+    there[:3, 3] = [300.0, -200.0, 100.0]
+    moved = likelihood.at(likelihood.points @ there[:3, :3].T + there[:3, 3])
+    turned = State(state.theta, there @ state.pose, there[:3, :3] @ state.center + there[:3, 3])
+    here, away = score_dependence(likelihood, state), score_dependence(moved, turned)
+    assert away.reach_cm == here.reach_cm
+    assert away.correlation == pytest.approx(here.correlation, rel=1e-6)
+    assert away.inflation == pytest.approx(here.inflation, rel=CELLS)
+
+
+def test_what_it_is_asked_of_stays_as_it_was():
+    likelihood, state = scene(2, n=300, width_cm=1.0, share=1.0)
+    points, theta = likelihood.points.copy(), state.theta.copy()
+    first, second = (score_dependence(likelihood, state) for _ in range(2))
+    np.testing.assert_array_equal(likelihood.points, points)
+    np.testing.assert_array_equal(state.theta, theta)
+    assert first.variability.tobytes() == second.variability.tobytes()
+
+
+def test_misfit_counts_as_correlation():
+    """A leaf whose side bend the model lacks lies off it in long stretches."""
+    random = np.random.default_rng(3)
+    bent = X.copy()
+    bent[10] = 15.0
+    bent[12] = 10.0
+    species = SPECIES.leading(7)
+    organs = move([organ.row(0) for organ in SPECIES.model.organs(bent)], np.eye(4))
+    points, _ = SurfaceSampler(600, 3, even=False).draw(organs)
+    points += random.normal(0.0, NOISE_CM, points.shape)
+    likelihood = CloudLikelihood(species.model, species.space, points)
+    found = score_dependence(likelihood, likelihood.start(X[:7], np.eye(4), 2.0 * NOISE_CM))
+    assert found.reach_cm > 1.0
+    assert found.inflation > 2.0
+
+
+# correlation over distance
+
+
+def sheet(seed, reach_cm, height, n=800, n_waves=1000):
+    """Places on a strip of 60 x 7 cm, and errors with a bell of that height and reach, on white noise.
+
+    The bell's part is a sum of many waves, whose wave numbers are normal as the bell's Fourier transform is.
+    """
+    random = np.random.default_rng(seed)
+    places = random.uniform(0.0, 1.0, (n, 3)) * [60.0, 7.0, 0.0]
+    wave = random.normal(0.0, 1.0 / reach_cm, (3, n_waves))
+    smooth = np.cos(places @ wave + random.uniform(0.0, 2.0 * np.pi, n_waves)).sum(axis=1) * np.sqrt(2.0 / n_waves)
+    return places, np.sqrt(height) * smooth + np.sqrt(1.0 - height) * random.normal(size=n)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("height", [0.5, 1.0])
+@pytest.mark.parametrize("reach_cm", [0.7, 1.4])
+def test_a_bell_over_distance_is_found(reach_cm, height, seed):
+    found_height, found_reach = _correlation(*sheet(seed, reach_cm, height))
+    assert found_reach == pytest.approx(reach_cm, rel=REACH)
+    assert found_height == pytest.approx(height, abs=HEIGHT)
+    assert 0.0 < found_height <= 1.0
+
+
+def test_it_does_not_depend_on_the_errors_size_or_sign():
+    places, errors = sheet(4, 1.4, 0.5, n=400)
+    once, other = _correlation(places, errors), _correlation(places, -100.0 * errors)
+    np.testing.assert_allclose(other, once, rtol=1e-6)
+
+
+@pytest.mark.parametrize("n", [300, 1500])
+def test_white_noise_is_not_correlated(n):
+    """In one of many sheets it may look as if it were."""
+    found = []
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        places = random.uniform(0.0, 1.0, (n, 3)) * [60.0, 7.0, 0.0]
+        found.append(_correlation(places, random.normal(size=n)) != (0.0, 0.0))
+    assert sum(found) <= 1
+
+
+def test_neighbours_that_are_unlike_each_other_are_not_called_correlated():
+    places, errors = sheet(6, 1.4, 0.5, n=400)
+    order = np.argsort(places[:, 0])
+    sign = np.empty(400)
+    sign[order] = np.tile([1.0, -1.0], 200)
+    assert _correlation(places, np.abs(errors) * sign) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("n", [0, 1])
+def test_no_neighbours(n):
+    assert _correlation(np.zeros((n, 3)), np.ones(n)) == (0.0, 0.0)
