@@ -33,6 +33,8 @@ bench: install
 	$(BIN)/python benchmarks/speed.py
 
 bench-accuracy: install
+	$(BIN)/python benchmarks/trust.py
+	$(BIN)/python benchmarks/robustness.py
 	$(BIN)/python benchmarks/accuracy.py
 
 docs: install

@@ -63,6 +63,13 @@ def test_accuracy_benchmark_runs():
     assert said.count("leaf_length") == 4  # parameter and trait, with and without stem above
 
 
+@pytest.mark.long
+def test_trust_benchmark_runs():
+    said = run("trust.py", "protocol", "correlated", "--phytomers", "3")
+    assert said.count("3 phytomers") == 2
+    assert "covered" in said
+
+
 @pytest.mark.parametrize("rounds", [1, 5, 60])
 def test_yardstick_is_plain_icp(clouds, rounds):
     peers = load_peers()

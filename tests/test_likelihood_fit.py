@@ -220,7 +220,41 @@ def test_a_cloud_without_noise_is_fitted():
     clean = phytofit.simulate(fixed=GENTLE, n_points=N_POINTS, noise_cm=0.0, seed=8)
     found = phytofit.fit(clean.points, "cm", threads=2)
     assert found.status is Status.AT_REST
+    assert any("had no noise" in note for note in found.notes)
     np.testing.assert_allclose(found.x[:7], clean.x[:7], atol=0.5)
+
+
+def no_phytomers():
+    """Clouds that hold none, 3,000 points each, cm."""
+    random = np.random.default_rng(3)
+    ball = random.standard_normal((3000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    angle = random.uniform(0, 2 * np.pi, 3000)
+    tube = np.stack([1.5 * np.cos(angle), 1.5 * np.sin(angle), random.uniform(0, 30, 3000)], axis=1)
+    two = phytofit.simulate(
+        seed=3, noise_cm=0.0, n_points=3000, random_orientation=False, fixed={"stem_length_above": 15.0}
+    )
+    other = two.points[two.labels == 2] * [-1.0, 1.0, 1.0] + [0.0, 0.0, -3.0]
+    return {
+        "sphere": 20.0 * ball,
+        "small sphere": 5.0 * ball,
+        "wall": random.uniform(0, 1, (3000, 3)) * [40.0, 30.0, 0.2],
+        "bare stem": tube,
+        "blade": random.uniform(-1, 1, (3000, 3)) * [30.0, 3.0, 0.1],
+        "box of noise": random.uniform(-20, 20, (3000, 3)),
+        "two leaves": np.concatenate([two.points, other]),
+    }
+
+
+@pytest.mark.parametrize("noise_cm", [0.1, 0.5])
+@pytest.mark.parametrize("shape", no_phytomers())
+def test_a_cloud_with_no_single_phytomer_is_refused_or_flagged(shape, noise_cm):
+    points = phytofit.add_noise(no_phytomers()[shape], noise_cm, np.random.default_rng(1))
+    try:
+        said = phytofit.fit(points, "cm", threads=2).flags
+    except phytofit.NoPhytomerError:
+        return
+    assert said
 
 
 @needs_data

@@ -62,7 +62,7 @@ def fit_command(
         str,
         typer.Option(
             help="likelihood: the most probable phytomer, with 95 % intervals. "
-            "paper: the search of Sodhi et al., IROS 2018, as it stands there."
+            "paper: the search of Sodhi et al., IROS 2018, for the least distance."
         ),
     ] = FIT["method"],
     distance: Annotated[
@@ -85,7 +85,7 @@ def fit_command(
         bool,
         typer.Option(
             "--stem-above/--no-stem-above",
-            help="Whether the stem may go on above the leaf; without, the paper's six parameters.",
+            help="Whether the stem may go on above the leaf; without, the paper's six parameters only.",
         ),
     ] = FIT["stem_above"],
     labels: Annotated[str, typer.Option(help="Name of the label property (1 stem, 2.. leaves).")] = "label",

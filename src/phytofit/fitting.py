@@ -13,13 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from phytofit.cloud import PointCloud, from_points
 from phytofit.distances import DISTANCES, Reference
-from phytofit.errors import SettingError, Status
+from phytofit.errors import NoPhytomerError, SettingError, Status
+from phytofit.flags import flags_of
 from phytofit.models import Organ, move
 from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parameters import ParameterSpace
 from phytofit.pose import StartPose
-from phytofit.posterior import Estimate, estimate
+from phytofit.posterior import DITHER_CM, Estimate, estimate
 from phytofit.preparation import Prepared, prepare
 from phytofit.species import Species, load_species
 from phytofit.traits import CHORD_CM, Trait, measure
@@ -32,6 +33,8 @@ N_PAPER = 6  # parameters of Eq. (1)
 N_SEARCHED = 7  # those and the stem above the leaf
 SEARCH = ("n_samples", "n_generations", "elite_fraction", "covariance_noise")
 Z_95 = 1.959963984540054  # standard errors to either side of a 95 % interval
+LEAST_ON_STEM = 10.0  # points; with fewer it is no stem
+DITHERED = f"the points had no noise: {DITHER_CM:g} cm was added, without which the likelihood can't be climbed"
 INTERVAL_METHOD = "sandwich interval"
 OPEN_WITHOUT_TIP = ("leaf_length", "leaf_area")  # no upper end where the tip was not seen
 PLAUSIBLE_LEAD = 4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
@@ -85,8 +88,8 @@ class Fit:
             return {}
         space = self.species.space
         half = Z_95 * np.sqrt(np.diag(self.covariance))
-        low = self._in_units(np.maximum(self.x - half, space.lower)).tolist()
-        high = self._in_units(np.minimum(self.x + half, space.upper)).tolist()
+        low = self._in_units(np.minimum(np.maximum(self.x - half, space.lower), self.x)).tolist()
+        high = self._in_units(np.maximum(np.minimum(self.x + half, space.upper), self.x)).tolist()
         return dict(zip(space.names, zip(low, high, strict=True), strict=True))
 
     def _in_units(self, x: FloatArray) -> FloatArray:
@@ -249,7 +252,7 @@ def fit(
         error=result.error * found.scale if method == "paper" else result.error,
         reference=found.used.points[found.kept],
         flags=(*((result.status.value,) if not result.status.good else ()), *result.flags),
-        notes=(*cloud.notes, *found.notes),
+        notes=(*cloud.notes, *found.notes, *result.notes),
         relative=cloud.unit == "none",
         scale=found.scale,
         settings={
@@ -261,7 +264,7 @@ def fit(
             "up": None if direction is None else direction.tolist(),
         },
     )
-    return _right_way_up(result, direction)
+    return _remarked(_right_way_up(result, direction))
 
 
 def fit_paper(
@@ -356,7 +359,7 @@ def fit_likelihood(
         reference=found.points,
         method="likelihood",
         estimate=most_probable,
-        flags=most_probable.flags,
+        notes=(DITHERED,) if most_probable.dithered else (),
     )
 
 
@@ -373,6 +376,30 @@ def _foot_pose(start: StartPose) -> FloatArray:
 def _defaults(function: Callable[..., Fit]) -> dict[str, Any]:
     parameters = inspect.signature(function).parameters.values()
     return {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
+
+
+def _remarked(result: Fit) -> Fit:
+    """The result with the flags of what it rests on; NoPhytomerError where it rests on no stem or no leaf."""
+    made = result.estimate
+    if made is None:
+        return result
+    length = next(t.value for t in result.traits if t.name == "leaf_length")
+    if made.sighting.stem_points < LEAST_ON_STEM or length <= 0.0:
+        raise NoPhytomerError(
+            f"no stem with a leaf was found: the best fit has {made.sighting.stem_points:.0f} points on its stem and a "
+            f"leaf of {length:.3g} cm"
+        )
+    flags = flags_of(
+        result.species.space,
+        result.x,
+        made.sighting,
+        noise=made.noise,
+        outlier_share=float(made.share[2]),
+        midrib_seen=made.seen,
+        tip_seen=made.tip_seen,
+        scale=result.scale,
+    )
+    return replace(result, flags=(*result.flags, *flags))
 
 
 def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:

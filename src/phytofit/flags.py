@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import LEAF, Organ
+from phytofit.parameters import ParameterSpace
 
 __all__ = ["Sighting", "flags_of", "sighting"]
 
@@ -21,7 +22,8 @@ FEW_ON_STEM = 60  # points
 LITTLE_EXPLAINED = 0.1  # share of outliers that is worth a remark
 MUCH_NOISE_CM = 1.0
 EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which the width is not resolved
-BOUNDED = ("stem_diameter", "stem_length", "leaf_angle", "leaf_length", "leaf_width")
+IMPLAUSIBLE = 4.0  # spreads of the prior
+BOUNDED = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width")
 NEAR_BOUND = 1e-6
 TIP_DOUBTFUL = "whether the tip was seen can't be told: the leaf may be longer"
 TIP_NOT_SEEN = "the tip was not seen: the leaf's length follows from its taper, and may be longer"
@@ -77,14 +79,23 @@ def _area_share(leaf: Organ, points: FloatArray) -> FloatArray:
     return share
 
 
-def flags_of(likelihood: CloudLikelihood, state: State, seen: Sighting, *, tip_doubtful: bool) -> Iterator[str]:
-    """The remarks on a fit."""
-    space = likelihood.space
-    x = dict(zip(space.names, state.x.tolist(), strict=True))
-    outliers = 100 * state.share[2]
-    if state.seen < 1.0:
+def flags_of(
+    space: ParameterSpace,
+    x: FloatArray,
+    seen: Sighting,
+    *,
+    noise: FloatArray,
+    outlier_share: float,
+    midrib_seen: float,
+    tip_seen: bool,
+    scale: float = 1.0,
+) -> Iterator[str]:
+    """The remarks on a fit: parameters x (k,), noise (2,) or more on stem and leaf, share of outliers, share of the
+    midrib that was seen, and whether its tip clearly was; `scale` input lengths make a cm."""
+    value = dict(zip(space.names, x.tolist(), strict=True))
+    if midrib_seen < 1.0:
         yield TIP_NOT_SEEN
-    elif tip_doubtful:
+    elif not tip_seen:
         yield TIP_DOUBTFUL
     if np.all(seen.sections[:BASE_SECTIONS] < SEEN_DENSITY):
         yield "the leaf's base is hidden: its angle is read off the rest of the leaf"
@@ -94,13 +105,27 @@ def flags_of(likelihood: CloudLikelihood, state: State, seen: Sighting, *, tip_d
         yield f"only {seen.stem_points:.0f} points on the stem"
     elif seen.sectors < ROUND:
         yield f"the stem was seen from one side: its diameter rests on {360 * seen.sectors:.0f}° of its circumference"
-    if state.share[2] >= LITTLE_EXPLAINED:
-        yield f"the model does not explain {outliers:.0f} % of the points"
-    for name, noise in zip(("stem", "leaf"), state.noise, strict=False):
-        if noise > MUCH_NOISE_CM:
-            yield f"the points scatter by {noise:.1f} cm around the {name}: far more than expected"
-    if 0.5 * x["leaf_width"] < EDGE_ON * state.noise[1]:
+    if outlier_share >= LITTLE_EXPLAINED:
+        yield f"the model does not explain {100 * outlier_share:.0f} % of the points"
+    for name, std in zip(("stem", "leaf"), noise, strict=False):
+        if std > MUCH_NOISE_CM:
+            scatter = f"{std * scale:.3g} {_length_unit(scale)}"
+            yield f"the points scatter by {scatter} around the {name}: far more than expected"
+    if 0.5 * value["leaf_width"] < EDGE_ON * noise[1]:
         yield "the leaf's width can't be told from the scatter of its points: was it seen edge-on?"
-    for i, name in enumerate(space.names):
-        if name in BOUNDED and min(x[name] - space.lower[i], space.upper[i] - x[name]) < NEAR_BOUND:
-            yield f"{name} lies at its bound, {x[name]:g} {space.units[i]}"
+    yield from _against_the_prior(space, x, scale)
+
+
+def _against_the_prior(space: ParameterSpace, x: FloatArray, scale: float) -> Iterator[str]:
+    for i, p in enumerate(space.parameters):
+        if p.name not in BOUNDED:
+            continue
+        value, unit = (x[i] * scale, _length_unit(scale)) if p.unit == "cm" else (x[i], p.unit)
+        if min(x[i] - p.lower, p.upper - x[i]) < NEAR_BOUND:
+            yield f"{p.name} lies at its bound, {value:.3g} {unit}"
+        elif abs(x[i] - p.mean) > IMPLAUSIBLE * p.std:
+            yield f"{p.name} is implausible for the species: {value:.3g} {unit}"
+
+
+def _length_unit(scale: float) -> str:
+    return "cm" if scale == 1.0 else "(relative length)"

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -13,19 +13,19 @@ from scipy.spatial import cKDTree
 
 from phytofit.dependence import Dependence, score_dependence
 from phytofit.distances import Reference, quantile_hausdorff
-from phytofit.flags import flags_of, sighting
+from phytofit.flags import Sighting, sighting
 from phytofit.likelihood import THICKNESS, CloudLikelihood, Evaluation, State
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
 from phytofit.species import Species
 
-__all__ = ["Estimate", "estimate"]
+__all__ = ["DITHER_CM", "Estimate", "estimate"]
 
 FloatArray = NDArray[np.float64]
 COARSE_POINTS = 700  # that decide which start is the best
 START_NOISE_CM = 2.0  # wide, so that a start some cm off is drawn in
 CUT_SHARE = 0.85  # of the midrib, from which the search for a missing tip starts
-DITHER_CM = 0.1
+DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its ten parameters gain five by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
@@ -43,7 +43,8 @@ class Estimate:
     it clearly is not; ``log_p`` (n,) of the points; ``evidence``: Laplace's approximation of the log probability of
     the cloud, up to a constant of the cloud; ``inflation``: how many times more the errors vary than those of
     independent points would; ``correlated_cm``: how far errors of neighbours are correlated, 0 if they are not;
-    ``flags``: remarks in plain words.
+    ``sighting``: what of the phytomer the cloud shows; ``dithered``: whether noise was added to the points, which had
+    none.
     """
 
     x: FloatArray
@@ -60,7 +61,8 @@ class Estimate:
     correlated_cm: float
     converged: bool
     history: tuple[Generation, ...]
-    flags: tuple[str, ...] = ()
+    sighting: Sighting
+    dithered: bool
 
 
 def estimate(
@@ -83,11 +85,11 @@ def estimate(
     Parameters
     ----------
     points : (n, 3) cm, as seen from the first start
-    starts : mean (7,) and pose (4, 4) of the model's frame to begin from, each
+    starts : mean (6 or 7,) and pose (4, 4) of the model's frame to begin from, each
     organ : (n,) 0 stem, 1 leaf, -1 unknown; None: all unknown
     n_samples, n_points, n_generations : of the cross-entropy search that finds the basin
     """
-    points = _dithered(points, seed)
+    given, points = points, _dithered(points, seed)
     plain = species.leading(len(starts[0][0]))
     search = CrossEntropy(
         plain.space,
@@ -149,7 +151,8 @@ def estimate(
     if best < len(found) - 1:
         dependence = score_dependence(end.likelihood, end.state)
     doubtful = best % 2 == 0 and gains[best] > TIP_DOUBTFUL
-    return _estimate(end, evidence[best], dependence, tuple(search.history), tip_doubtful=doubtful)
+    made = _estimate(end, evidence[best], dependence, tuple(search.history), tip_doubtful=doubtful)
+    return replace(made, dithered=points is not given)
 
 
 class _End(NamedTuple):
@@ -308,7 +311,8 @@ def _estimate(
         correlated_cm=dependence.reach_cm,
         converged=end.converged,
         history=history,
-        flags=tuple(flags_of(likelihood, state, sighting(likelihood, state, at.scores), tip_doubtful=tip_doubtful)),
+        sighting=sighting(likelihood, state, at.scores),
+        dithered=False,
     )
 
 

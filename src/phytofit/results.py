@@ -168,6 +168,9 @@ def _how_it_ended(result: Fit) -> dict[str, Any]:
     return {
         "noise": dict(zip(("stem", "leaf", "leaf_thickness"), noise.tolist(), strict=True)),
         "share": dict(zip(("stem", "leaf", "outliers"), made.share.tolist(), strict=True)),
+        "midrib_seen": made.seen,
+        "tip_seen": made.tip_seen,
+        "correlated_cm": made.correlated_cm,
         "evidence": made.evidence,
         "variance_inflation": made.inflation,
         "covariance": result.covariance.tolist(),
