@@ -1,8 +1,8 @@
 """The most probable phytomer of a cloud, and how well the cloud determines it."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -114,45 +114,18 @@ def estimate(
     )
     minimise(search, objective, progress)
     registration, _ = objective.register(search.mean)
-    begun = [(search.mean, registration.T_target_source), *starts]
+    cloud = _Cloud(points, organ, executor)
+    state = _drawn_in(plain, cloud, [(search.mean, registration.T_target_source), *starts])
+    chosen = _choice(_candidates(plain, species, cloud, state))
+    return _estimate(chosen, tuple(search.history), dithered=points is not given)
 
-    stride = max(1, len(points) // COARSE_POINTS)
-    coarse = CloudLikelihood(
-        plain.model,
-        plain.space,
-        points[::stride],
-        organ=None if organ is None else organ[::stride],
-        weights=np.full(len(points[::stride]), float(stride)),
-    )
-    states = [coarse.start(mean, pose, START_NOISE_CM) for mean, pose in begun]
-    ends = _mapped(executor, partial(_refined, coarse, max_iterations=30), states)
-    best = min(range(len(ends)), key=lambda i: ends[i].error)
-    state = State(ends[best].theta, states[best].pose, states[best].center)
 
-    found = [_end(plain, state, points, organ, executor)]
-    found.append(_end(plain, _cut(found[0].state), points, organ, executor, cut=True))
-    gain = found[1].fit_of_points - found[0].fit_of_points
-    if len(plain.space) < len(species.space):
-        simple = found[1] if gain > TIP_MISSING else found[0]
-        if _promise(species, simple, points, organ, executor) > SHAPE_PROMISE:
-            found.append(_end(species, found[0].state, points, organ, executor, thick=True))
-            found.append(_end(species, _cut(found[2].state), points, organ, executor, thick=True, cut=True))
-    dependence = score_dependence(found[-1].likelihood, found[-1].state)  # the richest: least misfit
-    evidence = [_evidence(end, dependence.inflation) for end in found]
-    # how much more probable the points are with the tip missing, of the models with and without it, two by two
-    gains = [
-        (found[i | 1].fit_of_points - found[i & ~1].fit_of_points) / dependence.inflation for i in range(len(found))
-    ]
-    backed = [
-        e if i % 2 == 0 or g > TIP_MISSING else -np.inf for i, (e, g) in enumerate(zip(evidence, gains, strict=True))
-    ]
-    best = int(np.argmax(backed))
-    end = found[best]
-    if best < len(found) - 1:
-        dependence = score_dependence(end.likelihood, end.state)
-    doubtful = best % 2 == 0 and gains[best] > TIP_DOUBTFUL
-    made = _estimate(end, evidence[best], dependence, tuple(search.history), tip_doubtful=doubtful)
-    return replace(made, dithered=points is not given)
+class _Cloud(NamedTuple):
+    """Points (n, 3), what their labels say (n,) or None, and who works on them."""
+
+    points: FloatArray
+    organ: NDArray[np.int8] | None
+    executor: Executor | None
 
 
 class _End(NamedTuple):
@@ -173,18 +146,64 @@ class _End(NamedTuple):
         return self.likelihood.lower < self.likelihood.upper
 
 
-def _end(
-    species: Species,
-    state: State,
-    points: FloatArray,
-    organ: NDArray[np.int8] | None,
-    executor: Executor | None,
-    *,
-    thick: bool = False,
-    cut: bool = False,
-) -> _End:
+class _Chosen(NamedTuple):
+    """The end that the cloud backs best."""
+
+    end: _End
+    evidence: float
+    dependence: Dependence
+    tip_doubtful: bool
+
+
+def _drawn_in(plain: Species, cloud: _Cloud, begun: Sequence[tuple[FloatArray, FloatArray]]) -> State:
+    """The best of what the beginnings (parameters and pose) lead to, with a part of the points and wide noise."""
+    stride = max(1, len(cloud.points) // COARSE_POINTS)
+    points = cloud.points[::stride]
+    coarse = CloudLikelihood(
+        plain.model,
+        plain.space,
+        points,
+        organ=None if cloud.organ is None else cloud.organ[::stride],
+        weights=np.full(len(points), float(stride)),
+    )
+    states = [coarse.start(mean, pose, START_NOISE_CM) for mean, pose in begun]
+    call = partial(_refined, coarse, max_iterations=30)
+    ends = list(map(call, states) if cloud.executor is None else cloud.executor.map(call, states))
+    best = min(range(len(ends)), key=lambda i: ends[i].error)
+    return State(ends[best].theta, states[best].pose, states[best].center)
+
+
+def _candidates(plain: Species, species: Species, cloud: _Cloud, state: State) -> list[_End]:
+    """Refined: the paper's model, the same with its tip missing, and, if they promise enough, the two with all
+    parameters of the species."""
+    found = [_end(plain, state, cloud)]
+    found.append(_end(plain, _cut(found[0].state), cloud, cut=True))
+    if len(plain.space) == len(species.space):
+        return found
+    simple = found[1] if found[1].fit_of_points - found[0].fit_of_points > TIP_MISSING else found[0]
+    if _promise(species, simple, cloud) > SHAPE_PROMISE:
+        found.append(_end(species, found[0].state, cloud, thick=True))
+        found.append(_end(species, _cut(found[2].state), cloud, thick=True, cut=True))
+    return found
+
+
+def _choice(found: Sequence[_End]) -> _Chosen:
+    """Of models whole and with the tip missing, in turn, the one with the most evidence; a tip is missing only where
+    that makes the points clearly more probable."""
+    dependence = score_dependence(found[-1].likelihood, found[-1].state)  # the richest: least misfit
+    fits = [end.fit_of_points / dependence.inflation for end in found]
+    gains = [fits[i | 1] - fits[i & ~1] for i in range(len(found))]
+    evidence = [_evidence(end, dependence.inflation) for end in found]
+    backed = [e if i % 2 == 0 or gains[i] > TIP_MISSING else -np.inf for i, e in enumerate(evidence)]
+    best = int(np.argmax(backed))
+    if best < len(found) - 1:
+        dependence = score_dependence(found[best].likelihood, found[best].state)
+    return _Chosen(found[best], evidence[best], dependence, best % 2 == 0 and gains[best] > TIP_DOUBTFUL)
+
+
+def _end(species: Species, state: State, cloud: _Cloud, *, thick: bool = False, cut: bool = False) -> _End:
     likelihood = CloudLikelihood(
-        species.model, species.space, points, organ=organ, thick=thick, cut=cut, executor=executor
+        species.model, species.space, cloud.points, organ=cloud.organ, thick=thick, cut=cut, executor=cloud.executor
     )
     state = likelihood.extended(state)
     end = _refined(likelihood, state)
@@ -205,15 +224,11 @@ def _dithered(points: FloatArray, seed: int) -> FloatArray:
     return points + np.random.default_rng(seed).normal(0.0, DITHER_CM, points.shape)
 
 
-def _promise(
-    species: Species,
-    end: _End,
-    points: FloatArray,
-    organ: NDArray[np.int8] | None,
-    executor: Executor | None,
-) -> float:
+def _promise(species: Species, end: _End, cloud: _Cloud) -> float:
     """Log probability that a richer leaf is expected to gain over the fitted one, by Rao's score test."""
-    likelihood = CloudLikelihood(species.model, species.space, points, organ=organ, cut=True, executor=executor)
+    likelihood = CloudLikelihood(
+        species.model, species.space, cloud.points, organ=cloud.organ, cut=True, executor=cloud.executor
+    )
     state = likelihood.extended(end.state)
     state.theta[THICKNESS] = end.state.theta[THICKNESS]
     _, gradient, information = _terms(likelihood, state)
@@ -234,10 +249,6 @@ def _at_junction(mean: FloatArray, pose: FloatArray) -> FloatArray:
     at = pose.copy()
     at[:3, 3] += pose[:3, 2] * mean[1]
     return at
-
-
-def _mapped(executor: Executor | None, call: Callable[[State], Refined], states: Iterable[State]) -> list[Refined]:
-    return list(map(call, states) if executor is None else executor.map(call, states))
 
 
 def _refined(likelihood: CloudLikelihood, state: State, max_iterations: int = 60) -> Refined:
@@ -284,9 +295,8 @@ def _evidence(end: _End, inflation: float) -> float:
     return float(at.log_p.sum() / inflation - surprise + prior - 0.5 * np.linalg.slogdet(information)[1])
 
 
-def _estimate(
-    end: _End, evidence: float, dependence: Dependence, history: tuple[Generation, ...], *, tip_doubtful: bool
-) -> Estimate:
+def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: bool) -> Estimate:
+    end, dependence = chosen.end, chosen.dependence
     likelihood, state, free = end.likelihood, end.state, end.free
     k = state.n_parameters
     at = likelihood.evaluate(state)
@@ -303,16 +313,16 @@ def _estimate(
         noise=state.noise,
         share=state.share,
         seen=state.seen,
-        tip_seen=state.seen == 1.0 and not tip_doubtful,
+        tip_seen=state.seen == 1.0 and not chosen.tip_doubtful,
         log_p=at.log_p,
         error=at.error,
-        evidence=evidence,
+        evidence=chosen.evidence,
         inflation=dependence.inflation,
         correlated_cm=dependence.reach_cm,
         converged=end.converged,
         history=history,
         sighting=sighting(likelihood, state, at.scores),
-        dithered=False,
+        dithered=dithered,
     )
 
 
