@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from phytofit import likelihood as module
@@ -67,7 +68,8 @@ def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0
     log_p = np.empty(n)
     log_density(
         np.array(points, float), np.full(n, organ, np.int8),
-        leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, np.zeros((m, 0, 9)), np.zeros(0),
+        leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, np.ones(m), np.zeros((m, 0, 9)),
+        np.zeros(0),
         stem.axis[0], stem.frame[0], float(stem.segment_lengths[0]), float(stem.half_width[0]), np.zeros((0, 8)),
         np.array(noise, float), np.array(share, float), float(outlier_density), log_p, np.empty((0, 5)),
     )  # fmt: skip
@@ -363,11 +365,34 @@ def test_the_likelihood_of_a_state_is_the_density_of_its_organs(cut):
     ]
     for organ in (-1, 0, 1):
         one = likelihood.organ == organ
-        outliers = 1.0 / np.prod(np.ptp(likelihood.points, axis=0) + 0.05 * np.ptp(likelihood.points, axis=0).max())
+        outliers = 1.0 / ConvexHull(likelihood.points).volume
         expected = density(
             likelihood.points[one], organs, state.noise, share=state.share, outlier_density=outliers, organ=organ
         )
         np.testing.assert_allclose(np.exp(likelihood.evaluate(state).log_p[one]), expected, rtol=1e-8)
+
+
+def test_the_density_along_a_leaf_weighs_its_pieces():
+    """A leaf is the mixture of its pieces by area and density; and the scores are the slopes still."""
+    likelihood, state = scene(SHAPED, 8, n=60)
+    state = disturbed(likelihood, state, np.random.default_rng(8))
+    state.theta[-1] = -9.0
+    weight = np.random.default_rng(9).uniform(0.1, 1.0, 30)
+    likelihood.organ = np.ones(60, np.int8)
+    likelihood.density = weight
+    leaf = grow(state.x)[1]
+    area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
+    parts = []
+    for j in range(30):
+        likelihood.density = np.eye(30)[j]
+        parts.append(np.exp(likelihood.evaluate(state, derivatives=False).log_p))
+    outliers = state.share[2] / ConvexHull(likelihood.points).volume
+    expected = (weight * area) @ (np.array(parts) - outliers) / (weight @ area) + outliers
+    likelihood.density = weight
+    np.testing.assert_allclose(np.exp(likelihood.evaluate(state).log_p), expected, rtol=1e-8)
+    likelihood.organ = np.full(60, -1, np.int8)
+    state.theta[-1] = -1.0
+    assert_scores_are_slopes(likelihood, state)
 
 
 def test_a_part_of_a_piece_may_be_missing(clean):
@@ -420,11 +445,11 @@ def test_the_pose_turns_about_the_junction_and_shifts():
     np.testing.assert_allclose(Rotation.from_matrix(turn).as_rotvec(), [0.3, -0.8, 0.4], atol=EXACT)
 
 
-def test_an_outlier_has_the_density_of_the_clouds_box():
-    """A little less than one over it; and a flat cloud has a box as well."""
+def test_an_outlier_has_the_density_of_the_clouds_hull():
+    """And a flat cloud has a box."""
     random = np.random.default_rng(10)
     points = random.uniform([0, 0, 0], [30, 20, 10], (50, 3)) + 500.0
-    points[:2] = [[500, 500, 500], [530, 520, 510]]
+    points[:8] = [[x, y, z] for x in (500, 530) for y in (500, 520) for z in (500, 510)]  # its hull is the box
     for cloud, volume in ((points, 30 * 20 * 10), (points * [1, 1, 0], 30 * 20 * 1.5)):
         likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, cloud)
         state = likelihood.start(X, np.eye(4), 0.3)

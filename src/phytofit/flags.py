@@ -10,11 +10,15 @@ from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import LEAF, Organ
 from phytofit.parameters import ParameterSpace
 
-__all__ = ["Sighting", "flags_of", "sighting"]
+__all__ = ["Sighting", "density_along", "flags_of", "sighting"]
 
 FloatArray = NDArray[np.float64]
 N_SECTIONS = 20  # of the leaf, of equal area
 SEEN_DENSITY = 0.25  # of the leaf's typical density, from which a section counts as seen
+TYPICAL = 0.75  # quantile of the densities of the leaf's pieces that counts as that where all was seen
+HOLE, LEAST_DENSITY = 0.7, 0.02  # of it: below the one it is a hole, below the other nothing is gained
+SMOOTHING = (0.25, 0.5, 0.25)  # of the numbers of points on pieces of the leaf
+CLEARLY, FEW_ON_PIECE = 3.0, 3.0  # standard deviations of the number of points; points
 N_SECTORS = 12  # around the stem
 ROUND = 0.7  # share of them that must be seen
 BASE_SECTIONS = 2  # the leaf's first tenth
@@ -65,18 +69,48 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
     return Sighting(found / typical, float(on_stem.sum()), float(shown))
 
 
+def density_along(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> FloatArray:
+    """Density (m,) of points on the pieces of the leaf, relative to where all was seen: 1 but in clear holes.
+
+    A hole has leaf on both sides: what is missing at the tip is another matter.
+    """
+    on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2]
+    pose = likelihood.pose_of(state)
+    points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]
+    leaf = likelihood.model.organs(state.x)[1].row(0)
+    area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
+    piece, _ = _place(leaf, points)
+    m = len(area)
+    found = np.bincount(piece, np.where(on_leaf > 0.5, on_leaf, 0.0), m).astype(float)
+    expected = np.convolve(area * found.sum() / area.sum(), SMOOTHING, "same")
+    found = np.convolve(found, SMOOTHING, "same")
+    ratio = found / np.maximum(expected, 1e-9)
+    expected *= np.quantile(ratio, TYPICAL)
+    ratio /= np.quantile(ratio, TYPICAL)
+    seen = np.flatnonzero((ratio >= 0.5) & (found >= FEW_ON_PIECE))
+    before = np.arange(m) < (seen[-1] if len(seen) else 0)
+    hole = before & (ratio < HOLE) & (expected - found > CLEARLY * np.sqrt(expected))
+    return np.where(hole, np.maximum(ratio, LEAST_DENSITY), 1.0)
+
+
 def _area_share(leaf: Organ, points: FloatArray) -> FloatArray:
     """Share (n,) of the leaf's area that lies nearer to its base than each point."""
     assert leaf.kind == LEAF
+    j, along = _place(leaf, points)
+    area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
+    before = np.concatenate([[0.0], np.cumsum(area)])
+    passed = before[j] + along / leaf.segment_lengths[j] * area[j]
+    share: FloatArray = passed / before[-1]
+    return share
+
+
+def _place(leaf: Organ, points: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+    """The piece (n,) of the midrib that is nearest to each point, and how far (n,) along it, cm."""
     offset = points[:, np.newaxis] - leaf.axis[:-1]
     along = np.clip(np.einsum("nmi,mi->nm", offset, leaf.frame[:, :, 0]), 0.0, leaf.segment_lengths)
     gap = offset - along[..., np.newaxis] * leaf.frame[:, :, 0]
     j = np.argmin(np.einsum("nmi,nmi->nm", gap, gap), axis=1)
-    area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
-    before = np.concatenate([[0.0], np.cumsum(area)])
-    passed = before[j] + along[np.arange(len(points)), j] / leaf.segment_lengths[j] * area[j]
-    share: FloatArray = passed / before[-1]
-    return share
+    return j, along[np.arange(len(points)), j]
 
 
 def flags_of(

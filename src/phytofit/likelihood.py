@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from phytofit.kernels.likelihood import LEAF_COLUMNS, STEM_COLUMNS, log_density
@@ -95,7 +96,7 @@ class CloudLikelihood:
     """-log p(cloud | phytomer) - log p(phytomer), with derivatives.
 
     A point is uniform by area on the stem (a tube) or the leaf (a strip), displaced by isotropic normal noise of the
-    organ's own level, or an outlier, uniform in the cloud's box.  Being a density, it needs no distance from model to
+    organ's own level, or an outlier, uniform in the cloud's hull.  Being a density, it needs no distance from model to
     cloud: a model larger than its data spreads its points thin, and pays.  Noise and shares are parameters, and so is
     the pose.
 
@@ -107,6 +108,7 @@ class CloudLikelihood:
     weights : (n,) of the points; None: all 1
     thick : whether the leaf may have a thickness, which widens the noise across the blade
     cut : whether the leaf's tip may be missing
+    density : (n_pieces,) of points on the pieces of the leaf, relative to where all was seen; None: 1 everywhere
     """
 
     def __init__(
@@ -119,6 +121,7 @@ class CloudLikelihood:
         weights: FloatArray | None = None,
         thick: bool = False,
         cut: bool = False,
+        density: FloatArray | None = None,
         executor: Executor | None = None,
     ) -> None:
         self.model = model
@@ -126,8 +129,8 @@ class CloudLikelihood:
         self.points = np.ascontiguousarray(points)
         self.organ = np.full(len(points), -1, np.int8) if organ is None else organ
         self.weights = weights
-        box = np.ptp(points, axis=0)
-        self._outlier_density = 1.0 / float(np.prod(box + 0.05 * box.max()))
+        self.density = np.ones(model.n_pieces) if density is None else density
+        self._outlier_density = 1.0 / _volume(self.points)
         self._executor = executor
         inside = 1.0 - STEM_SHARE - OUTLIER_SHARE
         shares = [np.log(STEM_SHARE / inside), np.log(OUTLIER_SHARE / inside)]
@@ -194,7 +197,7 @@ class CloudLikelihood:
         if derivatives:
             leaf_change[:, : k + 1] = _change(leaf, length, half, steps)
             stem_change[: k + 1] = _change(stem, stem.segment_lengths, stem.half_width, steps)[0, :, :STEM_COLUMNS]
-            area = np.sum(length * (half[:, 1:] + half[:, :-1]), axis=1)
+            area = np.sum(self.density * length * (half[:, 1:] + half[:, :-1]), axis=1)
             area_change[: k + 1] = np.diff(np.log(area[1:].reshape(2, k + 1)), axis=0)[0] / (-2.0 * steps)
             centre_in_model = r.T @ (state.center + state.shift - pose[:3, 3])
             turning = r.T @ _left_jacobian(state.turn)  # columns: axes of turning, in the model's frame
@@ -204,7 +207,8 @@ class CloudLikelihood:
         log_p = np.empty(n)
         scores = np.empty((n if derivatives else 0, k + N_EXTRA))
         arguments = (
-            leaf.axis[0, :-1] @ r.T + pose[:3, 3], r @ leaf.frame[0], length[0], half[0], leaf_change, area_change,
+            leaf.axis[0, :-1] @ r.T + pose[:3, 3], r @ leaf.frame[0], length[0], half[0], self.density,
+            leaf_change, area_change,
             r @ stem.axis[0, 0] + pose[:3, 3], r @ stem.frame[0, 0], float(stem.segment_lengths[0, 0]),
             float(stem.half_width[0, 0]), stem_change, state.noise, state.share, self._outlier_density,
         )  # fmt: skip
@@ -219,6 +223,15 @@ class CloudLikelihood:
             pass
         prior = 0.5 * float(np.sum((state.theta - self.mean) ** 2 * self.precision))
         return Evaluation(prior - float(log_p.sum() if self.weights is None else self.weights @ log_p), scores, log_p)
+
+
+def _volume(points: FloatArray) -> float:
+    """Volume, cm³, of the cloud's convex hull, in which outliers are uniform; of its box where it is flat."""
+    try:
+        return float(ConvexHull(points).volume)
+    except QhullError:
+        box = np.ptp(points, axis=0)
+        return float(np.prod(box + 0.05 * box.max()))
 
 
 def _seen(leaf: Organ, share: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from phytofit.dependence import Dependence, score_dependence
 from phytofit.distances import Reference, quantile_hausdorff
-from phytofit.flags import Sighting, sighting
+from phytofit.flags import Sighting, density_along, sighting
 from phytofit.likelihood import THICKNESS, CloudLikelihood, Evaluation, State
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
@@ -29,6 +29,7 @@ DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its ten parameters gain five by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
+HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
 LEAST_LEFT = 1.0 / 3.0  # of the residuals' degrees of freedom
 STEP = 0.02  # of a parameter's standard error, for differences of the gradient
 
@@ -202,12 +203,25 @@ def _choice(found: Sequence[_End]) -> _Chosen:
 
 
 def _end(species: Species, state: State, cloud: _Cloud, *, thick: bool = False, cut: bool = False) -> _End:
-    likelihood = CloudLikelihood(
-        species.model, species.space, cloud.points, organ=cloud.organ, thick=thick, cut=cut, executor=cloud.executor
-    )
-    state = likelihood.extended(state)
-    end = _refined(likelihood, state)
-    return _End(likelihood, State(end.theta, state.pose, state.center), end.converged)
+    density = None
+    for _ in range(HOLE_ROUNDS):
+        likelihood = CloudLikelihood(
+            species.model,
+            species.space,
+            cloud.points,
+            organ=cloud.organ,
+            thick=thick,
+            cut=cut,
+            density=density,
+            executor=cloud.executor,
+        )
+        state = likelihood.extended(state)
+        end = _refined(likelihood, state)
+        state = State(end.theta, state.pose, state.center)
+        density = density_along(likelihood, state, likelihood.evaluate(state).scores)
+        if np.allclose(density, likelihood.density, atol=0.05):
+            break
+    return _End(likelihood, state, end.converged)
 
 
 def _dithered(points: FloatArray, seed: int) -> FloatArray:

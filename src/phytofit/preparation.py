@@ -46,7 +46,8 @@ def prepare(
 ) -> Prepared:
     """Clean a cloud, find where its stem stands, and thin it as it looks from there.
 
-    The stem is looked for without outliers; `with_outliers` keeps them for the fit, in case that it accounts for them.
+    The stem is looked for without outliers; `with_outliers` keeps them for the fit, in case that it accounts for them,
+    and then thins the cloud at random: one point a voxel would change how points are spread around a surface.
     The coordinates are rounded, so that a rotated copy of the cloud gives the same numbers.
     """
     clean = used = cloud.take(remove_outliers(cloud.points))
@@ -56,7 +57,7 @@ def prepare(
     starts = start_poses(clean.points / scale, _largest_stem_radius(species), up=up)
     home = starts[0].pose
     upright = np.round((used.points / scale - home[:3, 3]) @ home[:3, :3], CANONICAL_DECIMALS)
-    kept = thin(upright, n_points)
+    kept = _some(len(upright), n_points) if with_outliers else thin(upright, n_points)
     return Prepared(
         used=used,
         kept=kept,
@@ -69,6 +70,13 @@ def prepare(
         scale=scale,
         notes=tuple(_what_was_left_out(len(cloud), len(used), len(kept))),
     )
+
+
+def _some(n: int, n_wanted: int) -> NDArray[np.intp]:
+    """Indices of so many of n points, drawn without regard to where they are; in order."""
+    if n <= n_wanted:
+        return np.arange(n)
+    return np.sort(np.random.default_rng(n).permutation(n)[:n_wanted])
 
 
 def _rigid_inverse(pose: FloatArray) -> FloatArray:

@@ -72,7 +72,7 @@ def _between(low, high, std):
 @kernel
 def log_density(
     points, organ,
-    leaf_origin, leaf_frame, leaf_length, leaf_half, leaf_change, leaf_area_change,
+    leaf_origin, leaf_frame, leaf_length, leaf_half, leaf_density, leaf_change, leaf_area_change,
     stem_origin, stem_frame, stem_length, radius, stem_change,
     noise, share, outlier_density,
     log_p, scores,
@@ -89,6 +89,7 @@ def log_density(
     organ : (n,) int8: 0 stem, 1 leaf; -1 unknown, may be of either
     leaf_origin (m, 3), leaf_frame (m, 3, 3) columns tangent, lateral, normal, leaf_length (m,), leaf_half (m + 1,) :
         the leaf's segments, and half widths at the nodes
+    leaf_density (m,) : of points on each segment, relative to where all was seen
     stem_origin (3,), stem_frame (3, 3) columns tangent and two across, stem_length, radius : the stem
     leaf_change (m, k, 9), leaf_area_change (k,), stem_change (k, 8) : change of a segment, in its own frame, of the
         logarithm of the leaf's area, and of the stem, for a unit change of each of k parameters
@@ -109,7 +110,7 @@ def log_density(
     depth = REACH * thickness
     area = 0.0
     for j in range(m):
-        area += leaf_length[j] * (leaf_half[j] + leaf_half[j + 1])
+        area += leaf_density[j] * leaf_length[j] * (leaf_half[j] + leaf_half[j + 1])
     floor = share[2] * outlier_density
     for i in range(n):
         on_stem = 0.0
@@ -182,7 +183,7 @@ def log_density(
                 s = min(max((u + square * pull) / length, 0.0), 1.0)
                 half = leaf_half[j] + s * slope
                 across = _between(v - half, v + half, leaf_noise)
-                density = weight * _normal(w, thickness) * along * across
+                density = weight * leaf_density[j] * _normal(w, thickness) * along * across
                 if density <= 0.0:
                     continue
                 on_leaf += density
