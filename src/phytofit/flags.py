@@ -18,7 +18,8 @@ SEEN_DENSITY = 0.25  # of the leaf's typical density, from which a section count
 TYPICAL = 0.75  # quantile of the densities of the leaf's pieces that counts as that where all was seen
 HOLE, LEAST_DENSITY = 0.7, 0.02  # of it: below the one it is a hole, below the other nothing is gained
 SMOOTHING = (0.25, 0.5, 0.25)  # of the numbers of points on pieces of the leaf
-CLEARLY, FEW_ON_PIECE = 3.0, 3.0  # standard deviations of the number of points; points
+OFF_STEM = 3.0  # noise levels from the stem, within which a leaf has no holes
+CLEARLY, FEW_ON_PIECE = 4.0, 3.0  # standard deviations of the number of points; points
 N_SECTORS = 12  # around the stem
 ROUND = 0.7  # share of them that must be seen
 BASE_SECTIONS = 2  # the leaf's first tenth
@@ -72,12 +73,13 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
 def density_along(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> FloatArray:
     """Density (m,) of points on the pieces of the leaf, relative to where all was seen: 1 but in clear holes.
 
-    A hole has leaf on both sides: what is missing at the tip is another matter.
+    A hole has leaf on both sides: what is missing at the tip is another matter, and near the stem it can't be told whose
+    the points are.
     """
     on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2]
     pose = likelihood.pose_of(state)
     points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]
-    leaf = likelihood.model.organs(state.x)[1].row(0)
+    stem, leaf = (organ.row(0) for organ in likelihood.model.organs(state.x))
     area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
     piece, _ = _place(leaf, points)
     m = len(area)
@@ -88,8 +90,10 @@ def density_along(likelihood: CloudLikelihood, state: State, scores: FloatArray)
     expected *= np.quantile(ratio, TYPICAL)
     ratio /= np.quantile(ratio, TYPICAL)
     seen = np.flatnonzero((ratio >= 0.5) & (found >= FEW_ON_PIECE))
+    middle = 0.5 * (leaf.axis[1:] + leaf.axis[:-1])
+    apart = np.hypot(middle[:, 0], middle[:, 1]) > stem.half_width[0] + OFF_STEM * max(state.noise[:2])
     before = np.arange(m) < (seen[-1] if len(seen) else 0)
-    hole = before & (ratio < HOLE) & (expected - found > CLEARLY * np.sqrt(expected))
+    hole = apart & before & (ratio < HOLE) & (expected - found > CLEARLY * np.sqrt(expected))
     return np.where(hole, np.maximum(ratio, LEAST_DENSITY), 1.0)
 
 
