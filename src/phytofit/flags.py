@@ -73,8 +73,8 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
 def density_along(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> FloatArray:
     """Density (m,) of points on the pieces of the leaf, relative to where all was seen: 1 but in clear holes.
 
-    A hole has leaf on both sides: what is missing at the tip is another matter, and near the stem it can't be told whose
-    the points are.
+    A hole has leaf on both sides: what is missing at the tip is another matter, and near the stem it can't be told
+    whose the points are.
     """
     on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2]
     pose = likelihood.pose_of(state)
