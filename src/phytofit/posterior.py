@@ -23,7 +23,7 @@ __all__ = ["DITHER_CM", "Estimate", "estimate"]
 
 FloatArray = NDArray[np.float64]
 COARSE_POINTS = 700  # that decide which start is the best
-START_NOISE_CM = 2.0  # wide, so that a start some cm off is drawn in
+START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some cm off is drawn in
 CUT_SHARE = 0.85  # of the midrib, from which the search for a missing tip starts
 DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
@@ -167,7 +167,8 @@ def _drawn_in(plain: Species, cloud: _Cloud, begun: Sequence[tuple[FloatArray, F
         organ=None if cloud.organ is None else cloud.organ[::stride],
         weights=np.full(len(points), float(stride)),
     )
-    states = [coarse.start(mean, pose, START_NOISE_CM) for mean, pose in begun]
+    noise_cm = START_NOISE * float(plain.space.mean[plain.space.index("leaf_length")])
+    states = [coarse.start(mean, pose, noise_cm) for mean, pose in begun]
     call = partial(_refined, coarse, max_iterations=30)
     ends = list(map(call, states) if cloud.executor is None else cloud.executor.map(call, states))
     best = min(range(len(ends)), key=lambda i: ends[i].error)
