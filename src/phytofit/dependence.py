@@ -28,11 +28,12 @@ CUT = 2.5  # reaches at which the correlation counts as none
 @dataclass(frozen=True)
 class Dependence:
     """``variability`` (k, k): covariance of the sum of the scores; ``inflation``: how many times that of independent
-    points it is, on average; ``reach_cm``: standard deviation of the correlation's bell, 0 if there is none;
-    ``correlation`` at no distance."""
+    points it is, on average; ``n_independent``: number of independent points whose mean error varies as much;
+    ``reach_cm``: standard deviation of the correlation's bell, 0 if there is none; ``correlation`` at no distance."""
 
     variability: FloatArray
     inflation: float
+    n_independent: float
     reach_cm: float
     correlation: float
 
@@ -62,7 +63,7 @@ def score_dependence(likelihood: CloudLikelihood, state: State) -> Dependence:
     place = likelihood.points - distance[:, np.newaxis] * frame[:, :, 2]
     correlation, reach = _correlation(place[sure], errors[sure])
     if correlation == 0.0:
-        return Dependence(independent, 1.0, 0.0, 0.0)
+        return Dependence(independent, 1.0, float(len(scores)), 0.0, 0.0)
 
     cell = np.floor(place / (CELL * reach)).astype(np.int64)
     number = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
@@ -81,7 +82,8 @@ def score_dependence(likelihood: CloudLikelihood, state: State) -> Dependence:
     variability = independent + correlation * (vectors * np.maximum(values, 0.0)) @ vectors.T
     factor = cho_factor(independent + np.diag(likelihood.precision + 1e-9))
     inflation = float(np.trace(cho_solve(factor, variability + np.diag(likelihood.precision)))) / len(independent)
-    return Dependence(variability, max(1.0, inflation), reach, correlation)
+    alike = correlation * float(count @ (weight @ count) * 2.0 + count @ count) + (1.0 - correlation) * len(scores)
+    return Dependence(variability, max(1.0, inflation), len(scores) ** 2 / alike, reach, correlation)
 
 
 def _change_of_scores(likelihood: CloudLikelihood, state: State, direction: FloatArray, std: FloatArray) -> FloatArray:
@@ -103,12 +105,13 @@ def _local(organs: tuple[Organ, ...], points: FloatArray, on_stem: NDArray[np.bo
     distance = np.einsum("ni,ni->n", offset[np.arange(len(points)), j], frame[:, :, 2])
     axis = stem.frame[0, :, 0]
     radial = points[on_stem] - stem.axis[0]
+    height, nodes = radial @ axis, np.concatenate([[0.0], np.cumsum(stem.segment_lengths)])
     radial -= (radial @ axis)[:, np.newaxis] * axis
     rho = np.linalg.norm(radial, axis=1)
     outward = radial / np.maximum(rho, 1e-9)[:, np.newaxis]
     axes = np.broadcast_to(axis, outward.shape)
     frame[on_stem] = np.stack([axes, np.cross(outward, axes), outward], axis=-1)
-    distance[on_stem] = rho - stem.half_width[0]
+    distance[on_stem] = rho - np.interp(height, nodes, stem.half_width)
     return frame, distance
 
 
@@ -130,11 +133,22 @@ def _correlation(points: FloatArray, errors: FloatArray) -> tuple[float, float]:
     best, found = np.inf, (0.0, 0.0)
     for reach in REACHES_CM:
         bell = np.exp(-0.5 * (middle / reach) ** 2)
-        square = float(np.sum(count * bell**2))
-        if square == 0.0:
-            continue
-        height = float(np.sum(count * bell * mean)) / square
-        misfit = float(np.sum(count * (mean - height * bell) ** 2))
+        height, below, square = _line(bell, mean, count)
+        if below > 0.0:
+            height, below, square = float(count @ (bell * mean)) / float(count @ bell**2), 0.0, float(count @ bell**2)
+        misfit = float(count @ (mean - below - height * bell) ** 2)
         if height * np.sqrt(square / twice) > CLEAR and misfit < best:
             best, found = misfit, (min(height, 1.0), float(reach))
     return found
+
+
+def _line(x: FloatArray, y: FloatArray, count: FloatArray) -> tuple[float, float, float]:
+    """Slope and intercept of a line through weighted points, and the sum of squares that the slope rests on.
+
+    A fit takes a part of the errors up, which leaves a little less than the bell at all distances: the intercept.
+    """
+    share = count / count.sum()
+    x_mean, y_mean = float(share @ x), float(share @ y)
+    square = max(float(count @ (x - x_mean) ** 2), 1e-12)
+    slope = float(count @ ((x - x_mean) * y)) / square
+    return slope, y_mean - slope * x_mean, square

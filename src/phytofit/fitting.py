@@ -32,7 +32,6 @@ AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": 
 N_PAPER = 6  # parameters of Eq. (1)
 N_SEARCHED = 7  # those and the stem above the leaf
 SEARCH = ("n_samples", "n_generations", "elite_fraction", "covariance_noise")
-Z_95 = 1.959963984540054  # standard errors to either side of a 95 % interval
 LEAST_ON_STEM = 10.0  # points; with fewer it is no stem
 DITHERED = f"the points had no noise: {DITHER_CM:g} cm was added, without which the likelihood can't be climbed"
 INTERVAL_METHOD = "sandwich interval"
@@ -87,7 +86,7 @@ class Fit:
         if self.estimate is None:
             return {}
         space = self.species.space
-        half = Z_95 * np.sqrt(np.diag(self.covariance))
+        half = self.estimate.quantile * np.sqrt(np.diag(self.covariance))
         low = self._in_units(np.minimum(np.maximum(self.x - half, space.lower), self.x)).tolist()
         high = self._in_units(np.maximum(np.minimum(self.x + half, space.upper), self.x)).tolist()
         return dict(zip(space.names, zip(low, high, strict=True), strict=True))
@@ -117,8 +116,8 @@ class Fit:
             traits = [
                 replace(
                     trait,
-                    low=max(0.0, trait.value - Z_95 * s),
-                    high=None if trait.name in open_above else trait.value + Z_95 * s,
+                    low=max(0.0, trait.value - self._not_seen(trait.name) - self.estimate.quantile * s),
+                    high=None if trait.name in open_above else trait.value + self.estimate.quantile * s,
                 )
                 if np.isfinite(s)
                 else trait
@@ -133,17 +132,33 @@ class Fit:
         chord = np.inf if self.relative else CHORD_CM
         return measure(self._organs_of(x), chord_cm=chord, method=method, flags=self.flags)
 
+    def _not_seen(self, name: str) -> float:
+        """What of a trait belongs to a tip that was not seen: the interval's low end is without it."""
+        assert self.estimate is not None
+        if name not in OPEN_WITHOUT_TIP or self.estimate.seen == 1.0:
+            return 0.0
+        leaf = self._organs_of(self.x)[1]
+        pieces = leaf.segment_lengths
+        if name == "leaf_area":
+            pieces = pieces * (leaf.half_width[1:] + leaf.half_width[:-1])
+        until = np.interp(
+            self.estimate.seen * len(pieces), np.arange(len(pieces) + 1), np.append(0.0, np.cumsum(pieces))
+        )
+        return float(pieces.sum() - until)
+
     def _trait_std(self, values: FloatArray) -> FloatArray:
         """Standard errors of the traits by the delta method, slopes taken over one standard error of each parameter."""
         steps = 0.5 * np.sqrt(np.diag(self.covariance))
+        space = self.species.space
         slopes = np.zeros((len(values), len(steps)))
         for i in np.flatnonzero(steps):
-            ends = []
+            at, ends = [], []
             for sign in (1.0, -1.0):
                 x = self.x.copy()
-                x[i] += sign * steps[i]
+                x[i] = np.clip(x[i] + sign * steps[i], space.lower[i], space.upper[i])
+                at.append(x[i])
                 ends.append(np.array([trait.value for trait in self._measured(x)]))
-            slopes[:, i] = (ends[0] - ends[1]) / (2.0 * steps[i])
+            slopes[:, i] = (ends[0] - ends[1]) / (at[0] - at[1])
         std: FloatArray = np.sqrt(np.einsum("ti,ij,tj->t", slopes, self.covariance, slopes))
         return std
 

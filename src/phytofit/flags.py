@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from phytofit.likelihood import CloudLikelihood, State
-from phytofit.models import LEAF, Organ
+from phytofit.models import LEAF, Organ, move
 from phytofit.parameters import ParameterSpace
 
-__all__ = ["Sighting", "density_along", "flags_of", "sighting"]
+__all__ = ["Sighting", "across_leaf", "density_along", "flags_of", "sighting"]
 
 FloatArray = NDArray[np.float64]
 N_SECTIONS = 20  # of the leaf, of equal area
@@ -20,17 +21,20 @@ HOLE, LEAST_DENSITY = 0.7, 0.02  # of it: below the one it is a hole, below the 
 SMOOTHING = (0.25, 0.5, 0.25)  # of the numbers of points on pieces of the leaf
 OFF_STEM = 3.0  # noise levels from the stem, within which a leaf has no holes
 CLEARLY, FEW_ON_PIECE = 4.0, 3.0  # standard deviations of the number of points; points
+NEAR_TIP, FEW_BEYOND, N_BEYOND = 0.15, 12, 4000  # of the leaf's length; points; points drawn around the tip
 N_SECTORS = 12  # around the stem
 ROUND = 0.7  # share of them that must be seen
 BASE_SECTIONS = 2  # the leaf's first tenth
 FEW_ON_STEM = 60  # points
 LITTLE_EXPLAINED = 0.1  # share of outliers that is worth a remark
 MUCH_NOISE_CM = 1.0
+BLURRED = 2.0  # stem noises in a stem's radius, below which a tube can't be told from a filled stem
 EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which the width is not resolved
 IMPLAUSIBLE = 4.0  # spreads of the prior
 BOUNDED = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width")
 NEAR_BOUND = 1e-6
 TIP_DOUBTFUL = "whether the tip was seen can't be told: the leaf may be longer"
+BEYOND_TIP = "{:.0f} points near the leaf's tip are not explained: the leaf may go on there"
 TIP_NOT_SEEN = "the tip was not seen: the leaf's length follows from its taper, and may be longer"
 
 
@@ -39,12 +43,14 @@ class Sighting:
     """What of a phytomer the cloud shows.
 
     ``sections`` (20,) density of points on sections of the leaf, base to tip, in units of the typical one;
-    ``stem_points`` number of points on the stem; ``sectors`` share of the stem's circumference with points.
+    ``stem_points`` number of points on the stem; ``sectors`` share of the stem's circumference with points;
+    ``beyond`` number of points near the leaf's tip that are of no organ; if there are more than by chance, else 0.
     """
 
     sections: FloatArray
     stem_points: float
     sectors: float
+    beyond: float
 
     @property
     def leaf(self) -> float:
@@ -67,7 +73,25 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
     angle = np.arctan2(stem_points[:, 1], stem_points[:, 0])
     sector = np.bincount(((angle + np.pi) / (2 * np.pi) * N_SECTORS).astype(int) % N_SECTORS, minlength=N_SECTORS)
     shown = np.mean(sector > SEEN_DENSITY * np.quantile(sector, 0.75)) if len(stem_points) else 0.0
-    return Sighting(found / typical, float(on_stem.sum()), float(shown))
+    beyond = _beyond_tip(likelihood, state, scores)
+    return Sighting(found / typical, float(on_stem.sum()), float(shown), float(beyond))
+
+
+def _beyond_tip(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> int:
+    """Number of points near the leaf's tip that are of no organ, 0 if there are not more than outliers would be there
+    by chance: the leaf may go on there, where the model does not."""
+    outlier = scores[:, -1] + state.share[2]
+    leaf = move([likelihood.model.organs(state.x)[1].row(0)], likelihood.pose_of(state))[0]
+    near = NEAR_TIP * leaf.segment_lengths.sum()
+    there = likelihood.points[(outlier > 0.5) & (np.linalg.norm(likelihood.points - leaf.axis[-1], axis=1) < near)]
+    if len(there) <= FEW_BEYOND:
+        return 0
+    offset = np.random.default_rng(0).uniform(-near, near, (N_BEYOND, 3))  # how much of the hull lies near the tip
+    around = leaf.axis[-1] + offset[np.linalg.norm(offset, axis=1) < near]
+    planes = ConvexHull(likelihood.points).equations
+    inside = np.mean(np.all(around @ planes[:, :3].T + planes[:, 3] < 0.0, axis=1))
+    expected = float(outlier.sum()) * inside * 4.0 / 3.0 * np.pi * near**3 * likelihood.outlier_density
+    return len(there) if len(there) > expected + CLEARLY * np.sqrt(expected) else 0
 
 
 def density_along(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> FloatArray:
@@ -91,10 +115,21 @@ def density_along(likelihood: CloudLikelihood, state: State, scores: FloatArray)
     ratio /= np.quantile(ratio, TYPICAL)
     seen = np.flatnonzero((ratio >= 0.5) & (found >= FEW_ON_PIECE))
     middle = 0.5 * (leaf.axis[1:] + leaf.axis[:-1])
-    apart = np.hypot(middle[:, 0], middle[:, 1]) > stem.half_width[0] + OFF_STEM * max(state.noise[:2])
+    apart = np.hypot(middle[:, 0], middle[:, 1]) > stem.half_width.max() + OFF_STEM * max(state.noise[:2])
     before = np.arange(m) < (seen[-1] if len(seen) else 0)
     hole = apart & before & (ratio < HOLE) & (expected - found > CLEARLY * np.sqrt(expected))
     return np.where(hole, np.maximum(ratio, LEAST_DENSITY), 1.0)
+
+
+def across_leaf(likelihood: CloudLikelihood, state: State) -> tuple[FloatArray, FloatArray]:
+    """Share (n,) of the midrib at which each point lies, and where (n, 2) across it: cm sideways, and off the blade."""
+    pose = likelihood.pose_of(state)
+    points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]
+    leaf = likelihood.model.organs(state.x)[1].row(0)
+    j, along = _place(leaf, points)
+    lengths = leaf.segment_lengths
+    place = (np.concatenate([[0.0], np.cumsum(lengths)])[j] + along) / lengths.sum()
+    return place, np.einsum("nib,ni->nb", leaf.frame[j][:, :, 1:], points - leaf.axis[j])
 
 
 def _area_share(leaf: Organ, points: FloatArray) -> FloatArray:
@@ -135,6 +170,8 @@ def flags_of(
         yield TIP_NOT_SEEN
     elif not tip_seen:
         yield TIP_DOUBTFUL
+    if seen.beyond:
+        yield BEYOND_TIP.format(seen.beyond)
     if np.all(seen.sections[:BASE_SECTIONS] < SEEN_DENSITY):
         yield "the leaf's base is hidden: its angle is read off the rest of the leaf"
     if seen.leaf < 0.5:
@@ -149,6 +186,8 @@ def flags_of(
         if std > MUCH_NOISE_CM:
             scatter = f"{std * scale:.3g} {_length_unit(scale)}"
             yield f"the points scatter by {scatter} around the {name}: far more than expected"
+    if 0.5 * value["stem_diameter"] < BLURRED * noise[0]:
+        yield "the stem's points scatter by half its radius or more: its diameter is that of a tube, it may be filled"
     if 0.5 * value["leaf_width"] < EDGE_ON * noise[1]:
         yield "the leaf's width can't be told from the scatter of its points: was it seen edge-on?"
     yield from _against_the_prior(space, x, scale)

@@ -95,10 +95,10 @@ class Evaluation:
 class CloudLikelihood:
     """-log p(cloud | phytomer) - log p(phytomer), with derivatives.
 
-    A point is uniform by area on the stem (a tube) or the leaf (a strip), displaced by isotropic normal noise of the
-    organ's own level, or an outlier, uniform in the cloud's hull.  Being a density, it needs no distance from model to
-    cloud: a model larger than its data spreads its points thin, and pays.  Noise and shares are parameters, and so is
-    the pose.
+    A point is uniform by area on the stem (a tube) or the leaf (a strip), displaced by isotropic normal
+    noise of the organ's own level, or an outlier, uniform in the cloud's hull.  Being a density, it needs no distance
+    from model to cloud: a model larger than its data spreads its points thin, and pays.  Noise and shares are
+    parameters, and so is the pose.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ class CloudLikelihood:
         self.organ = np.full(len(points), -1, np.int8) if organ is None else organ
         self.weights = weights
         self.density = np.ones(model.n_pieces) if density is None else density
-        self._outlier_density = 1.0 / _volume(self.points)
+        self.outlier_density = 1.0 / _volume(self.points)
         self._executor = executor
         inside = 1.0 - STEM_SHARE - OUTLIER_SHARE
         shares = [np.log(STEM_SHARE / inside), np.log(OUTLIER_SHARE / inside)]
@@ -192,25 +192,30 @@ class CloudLikelihood:
         r = pose[:3, :3]
         n_columns = k + 7 if derivatives else 0
         leaf_change = np.zeros((leaf.frame.shape[1], n_columns, LEAF_COLUMNS))
-        stem_change = np.zeros((n_columns, STEM_COLUMNS))
-        area_change = np.zeros(n_columns)
+        stem_change = np.zeros((stem.frame.shape[1], n_columns, STEM_COLUMNS))
+        area_change, stem_area_change = np.zeros(n_columns), np.zeros(n_columns)
+        stem_length = stem.segment_lengths
+        radius = 0.5 * (stem.half_width[:, 1:] + stem.half_width[:, :-1])
         if derivatives:
             leaf_change[:, : k + 1] = _change(leaf, length, half, steps)
-            stem_change[: k + 1] = _change(stem, stem.segment_lengths, stem.half_width, steps)[0, :, :STEM_COLUMNS]
-            area = np.sum(self.density * length * (half[:, 1:] + half[:, :-1]), axis=1)
-            area_change[: k + 1] = np.diff(np.log(area[1:].reshape(2, k + 1)), axis=0)[0] / (-2.0 * steps)
+            stem_change[:, : k + 1, :-1] = _change(stem, stem_length, stem.half_width, steps)[..., :-2]
+            stem_change[:, : k + 1, -1] = _slope(radius, steps).T
+            area_change[: k + 1] = _slope(
+                np.log(np.sum(self.density * length * (half[:, 1:] + half[:, :-1]), 1)), steps
+            )
+            stem_area_change[: k + 1] = _slope(np.log(np.sum(stem_length * radius, 1)), steps)
             centre_in_model = r.T @ (state.center + state.shift - pose[:3, 3])
             turning = r.T @ _left_jacobian(state.turn)  # columns: axes of turning, in the model's frame
             leaf_change[:, k + 1 :, :6] = _pose_change(leaf.axis[0, :-1], leaf.frame[0], turning, r.T, centre_in_model)
-            stem_change[k + 1 :, :6] = _pose_change(stem.axis[0, :1], stem.frame[0], turning, r.T, centre_in_model)[0]
+            stem_change[:, k + 1 :, :6] = _pose_change(stem.axis[0, :-1], stem.frame[0], turning, r.T, centre_in_model)
         n = len(self.points)
         log_p = np.empty(n)
         scores = np.empty((n if derivatives else 0, k + N_EXTRA))
         arguments = (
             leaf.axis[0, :-1] @ r.T + pose[:3, 3], r @ leaf.frame[0], length[0], half[0], self.density,
             leaf_change, area_change,
-            r @ stem.axis[0, 0] + pose[:3, 3], r @ stem.frame[0, 0], float(stem.segment_lengths[0, 0]),
-            float(stem.half_width[0, 0]), stem_change, state.noise, state.share, self._outlier_density,
+            stem.axis[0, :-1] @ r.T + pose[:3, 3], r @ stem.frame[0], stem_length[0], radius[0],
+            stem_change, stem_area_change, state.noise, state.share, self.outlier_density,
         )  # fmt: skip
 
         def block(first: int) -> None:
@@ -247,17 +252,10 @@ def _seen(leaf: Organ, share: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _change(organ: Organ, length: FloatArray, half: FloatArray, steps: FloatArray) -> FloatArray:
     """Change (m, k, 9) of each segment per unit of each parameter, in the segment's own frame, by central differences
     of a population: row 0 as it is, rows 1 .. k with a parameter raised by its step, rows k + 1 .. 2 k lowered."""
-    k = len(steps)
     frame = organ.frame[0]  # (m, 3, 3)
-
-    def slope(values: FloatArray) -> FloatArray:
-        both = values[1:].reshape(2, k, *values.shape[1:])
-        difference: FloatArray = (both[0] - both[1]) / (2.0 * steps.reshape(k, *[1] * (values.ndim - 1)))
-        return difference
-
-    shift = np.einsum("mij,kmi->mkj", frame, slope(organ.axis[:, :-1]))
-    turn = np.einsum("mij,kmil->mkjl", frame, slope(organ.frame))  # skew
-    of_length, of_half = slope(length).T, slope(half).T
+    shift = np.einsum("mij,kmi->mkj", frame, _slope(organ.axis[:, :-1], steps))
+    turn = np.einsum("mij,kmil->mkjl", frame, _slope(organ.frame, steps))  # skew
+    of_length, of_half = _slope(length, steps).T, _slope(half, steps).T
     return np.concatenate(
         [
             shift,
@@ -266,6 +264,14 @@ def _change(organ: Organ, length: FloatArray, half: FloatArray, steps: FloatArra
         ],
         axis=-1,
     )
+
+
+def _slope(values: FloatArray, steps: FloatArray) -> FloatArray:
+    """Change (k, ...) of values (2 k + 1, ...) of such a population per unit of each parameter."""
+    k = len(steps)
+    both = values[1:].reshape(2, k, *values.shape[1:])
+    difference: FloatArray = (both[0] - both[1]) / (2.0 * steps.reshape(k, *[1] * (values.ndim - 1)))
+    return difference
 
 
 def _pose_change(

@@ -9,11 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor
+from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
+from scipy.special import stdtrit
 
 from phytofit.dependence import Dependence, score_dependence
 from phytofit.distances import Reference, quantile_hausdorff
-from phytofit.flags import Sighting, density_along, sighting
+from phytofit.flags import Sighting, across_leaf, density_along, sighting
 from phytofit.likelihood import THICKNESS, CloudLikelihood, Evaluation, State
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
@@ -30,6 +32,11 @@ N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its ten parameters gain five by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
+TURNED = 30.0  # degrees from level, from which a blade is also begun turned
+LOWER_ROUNDS = 3
+LOWER, LEAST_LOWER_CM = 0.12, 2.0  # of the leaf's length, by which its insertion is also tried lower down
+PRIOR_CM = 0.2  # by which its midrib may be moved to make it a spread of the prior more plausible
+LEAST_ACROSS = 20  # points that say how a half of it lies
 LEAST_LEFT = 1.0 / 3.0  # of the residuals' degrees of freedom
 STEP = 0.02  # of a parameter's standard error, for differences of the gradient
 
@@ -44,8 +51,8 @@ class Estimate:
     it clearly is not; ``log_p`` (n,) of the points; ``evidence``: Laplace's approximation of the log probability of
     the cloud, up to a constant of the cloud; ``inflation``: how many times more the errors vary than those of
     independent points would; ``correlated_cm``: how far errors of neighbours are correlated, 0 if they are not;
-    ``sighting``: what of the phytomer the cloud shows; ``dithered``: whether noise was added to the points, which had
-    none.
+    ``quantile``: standard errors to either side of a 95 % interval, Student's; ``sighting``: what of the phytomer the
+    cloud shows; ``dithered``: whether noise was added to the points, which had none.
     """
 
     x: FloatArray
@@ -60,6 +67,7 @@ class Estimate:
     evidence: float
     inflation: float
     correlated_cm: float
+    quantile: float
     converged: bool
     history: tuple[Generation, ...]
     sighting: Sighting
@@ -184,9 +192,81 @@ def _candidates(plain: Species, species: Species, cloud: _Cloud, state: State) -
         return found
     simple = found[1] if found[1].fit_of_points - found[0].fit_of_points > TIP_MISSING else found[0]
     if _promise(species, simple, cloud) > SHAPE_PROMISE:
-        found.append(_end(species, found[0].state, cloud, thick=True))
+        begun = [found[0].state, *_turned_blade(species, found[0])]
+        best = max((_end(species, it, cloud, thick=True) for it in begun), key=lambda end: end.fit_of_points)
+        for _ in range(LOWER_ROUNDS):
+            lower = [_end(species, it, cloud, thick=True) for it in _lower_insertion(species, best.state)]
+            if not lower or lower[0].fit_of_points < best.fit_of_points + TIP_MISSING:
+                break
+            best = lower[0]
+        found.append(best)
         found.append(_end(species, _cut(found[2].state), cloud, thick=True, cut=True))
     return found
+
+
+def _turned_blade(species: Species, end: _End) -> list[State]:
+    """The state with its blade turned about the midrib as the leaf's points lie across it, where that is far from
+    level: a blade on edge is a local optimum of a level one."""
+    likelihood, state = end.likelihood, end.state
+    at = likelihood.evaluate(state)
+    on_leaf = 1.0 - at.scores[:, -2] - state.share[0] - at.scores[:, -1] - state.share[2] > 0.5
+    place, across = across_leaf(likelihood, state)
+    turn = np.zeros(2)
+    spread = np.zeros((2, 2))
+    for half in range(2):
+        those = across[on_leaf & (place >= 0.5 * half) & (place <= 0.5 * (half + 1))]
+        if len(those) < LEAST_ACROSS:
+            return []
+        moment = np.cov(those.T)
+        turn[half] = 0.5 * np.rad2deg(np.arctan2(2.0 * moment[0, 1], moment[0, 0] - moment[1, 1]))
+        spread[half] = np.sqrt(np.linalg.eigvalsh(moment))
+    twist = 2.0 * ((turn[1] - turn[0] + 90.0) % 180.0 - 90.0)
+    roll = turn[0] - 0.25 * twist
+    if max(abs(turn)) < TURNED:
+        return []
+    theta = state.theta.copy()
+    names = species.space.names
+    x = np.concatenate([state.x, species.space.mean[state.n_parameters :]])
+    x[names.index("leaf_roll")], x[names.index("leaf_twist")] = roll, twist
+    x[names.index("leaf_width")] = 2.0 * np.sqrt(3.0) * spread[:, 1].max()  # as of a uniform strip
+    theta[-4] = np.log(spread[:, 0].mean())
+    inside = np.clip(x, species.space.lower, species.space.upper)
+    return [State(np.concatenate([inside, theta[state.n_parameters :]]), state.pose, state.center)]
+
+
+def _lower_insertion(species: Species, state: State) -> list[State]:
+    """The state with a leaf that leaves the stem lower down, along it at first, and then lies where it lay: a leaf that
+    hugs the stem is a local optimum away from one that leaves it higher up, at once."""
+    space, k, x = species.space, state.n_parameters, state.x
+    drop = min(LOWER * x[3], x[1] - space.lower[1])
+    if drop < LEAST_LOWER_CM:
+        return []
+    tip = np.linspace(0.0, (1.0 - LOWER) * x[3], 12)  # lengths from the tip, at which the leaf stays where it is
+    nodes = np.linspace(1.0, 0.0, species.model.n_pieces + 1)
+    changed = [
+        space.index(name) for name in ("leaf_angle", "leaf_length", "leaf_rotate_angle", "leaf_bow", "leaf_wave")
+    ]
+
+    def midrib(x: FloatArray) -> FloatArray:
+        axis = species.model.organs(x)[1].axis[0][::-1]
+        return np.stack([np.interp(tip, nodes[::-1] * x[3], column) for column in axis.T])
+
+    def lowered(values: FloatArray) -> FloatArray:
+        other = x.copy()
+        other[1], other[6], other[space.index("collar_offset")] = x[1] - drop, x[6] + drop, 1.0
+        other[changed] = values
+        return np.clip(other, space.lower, space.upper)
+
+    there = midrib(x)
+
+    def misfit(values: FloatArray) -> FloatArray:
+        surprise = (values - space.mean[changed]) / space.std[changed]
+        residuals: FloatArray = np.concatenate([(midrib(lowered(values)) - there).ravel(), PRIOR_CM * surprise])
+        return residuals
+
+    begun = x[changed] + [-0.5 * x[2], drop, 0.0, 0.0, 0.0]
+    found = lowered(least_squares(misfit, begun, method="lm", x_scale=space.std[changed]).x)
+    return [State(np.concatenate([found, state.theta[k:]]), state.pose, state.center)]
 
 
 def _choice(found: Sequence[_End]) -> _Chosen:
@@ -317,10 +397,12 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     at = likelihood.evaluate(state)
     covariance = np.zeros((len(free), len(free)))
     inverse = np.linalg.inv(_curvature(end, at))
+    left = max(
+        dependence.n_independent - free.sum(), LEAST_LEFT * dependence.n_independent
+    )  # a fit takes some errors up
     variability = (dependence.variability + np.diag(likelihood.precision))[np.ix_(free, free)]
-    covariance[np.ix_(free, free)] = (
-        inverse @ variability @ inverse * _small_sample(len(likelihood.points) / dependence.inflation, int(free.sum()))
-    )
+    covariance[np.ix_(free, free)] = inverse @ variability @ inverse * dependence.n_independent / left
+    seen = sighting(likelihood, state, at.scores)
     return Estimate(
         x=state.x.copy(),
         covariance=covariance[:k, :k],
@@ -328,22 +410,18 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         noise=state.noise,
         share=state.share,
         seen=state.seen,
-        tip_seen=state.seen == 1.0 and not chosen.tip_doubtful,
+        tip_seen=state.seen == 1.0 and not chosen.tip_doubtful and not seen.beyond,
         log_p=at.log_p,
         error=at.error,
         evidence=chosen.evidence,
         inflation=dependence.inflation,
         correlated_cm=dependence.reach_cm,
+        quantile=float(stdtrit(left, 0.975)),
         converged=end.converged,
         history=history,
-        sighting=sighting(likelihood, state, at.scores),
+        sighting=seen,
         dithered=dithered,
     )
-
-
-def _small_sample(n_independent: float, k: int) -> float:
-    """By how much errors vary more than the residuals of a fit of k parameters, which has taken some of them up."""
-    return n_independent / max(n_independent - k, LEAST_LEFT * n_independent)
 
 
 def _curvature(end: _End, at: Evaluation) -> FloatArray:

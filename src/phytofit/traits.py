@@ -52,7 +52,7 @@ def measure(
     leaf_width               cm     widest, across the blade
     leaf_curvature           deg/cm mean turning of the midrib
     leaf_area                cm²    one side of the blade
-    stem_diameter            cm     outer diameter, mean along the piece
+    stem_diameter            cm     outer diameter, mean of the piece below its lowest leaf, whose sheath it includes
     stem_length              cm     of the piece in the cloud
     ======================== ====== ==============================================================================
 
@@ -62,13 +62,12 @@ def measure(
     assert stem.kind == STEM
     assert all(leaf.kind == LEAF for leaf in leaves)
     lengths = stem.segment_lengths
-    width = stem.half_width[1:] + stem.half_width[:-1]
     traits = [
         Trait(
             STEM,
             0,
             "stem_diameter",
-            float(np.average(width, weights=lengths)),
+            _diameter_below(stem, leaves),
             "cm",
             None,
             None,
@@ -81,6 +80,24 @@ def measure(
         values = _leaf(stem, leaf, chord_cm)
         traits += [Trait(LEAF, rank, name, value, unit, None, None, method, flags) for name, value, unit in values]
     return traits
+
+
+def _diameter_below(stem: Organ, leaves: Sequence[Organ]) -> float:
+    """Mean diameter of the stem below its lowest leaf; of all of it if it has none, or nothing below."""
+    node_at = np.concatenate([[0.0], np.cumsum(stem.segment_lengths)])
+    top = min((_nearest_on(stem, node_at, leaf.axis[0]) for leaf in leaves), default=0.0) or node_at[-1]
+    at = np.append(node_at[node_at < top], top)
+    width = 2.0 * np.interp(at, node_at, stem.half_width)
+    return float(np.average(0.5 * (width[1:] + width[:-1]), weights=np.diff(at)))
+
+
+def _nearest_on(stem: Organ, node_at: FloatArray, point: FloatArray) -> float:
+    """Length along the stem's axis at which it is nearest to the point."""
+    start, step = stem.axis[:-1], np.diff(stem.axis, axis=0)
+    share = np.einsum("ja,ja->j", point - start, step) / np.maximum(np.einsum("ja,ja->j", step, step), 1e-300)
+    share = np.clip(share, 0.0, 1.0)
+    j = int(np.argmin(np.linalg.norm(start + share[:, np.newaxis] * step - point, axis=1)))
+    return float(node_at[j] + share[j] * (node_at[j + 1] - node_at[j]))
 
 
 def _leaf(stem: Organ, leaf: Organ, chord_cm: float) -> list[tuple[str, float, str]]:
@@ -135,8 +152,8 @@ def _leaves_stem_at(stem: Organ, leaf: Organ, node_at: FloatArray) -> float:
 
 def _stem_direction(stem: Organ, point: FloatArray) -> FloatArray:
     """Direction of the stem's segment nearest to the point."""
-    middle = 0.5 * (stem.axis[1:] + stem.axis[:-1])
-    j = int(np.argmin(np.linalg.norm(middle - point, axis=1)))
+    distance = np.linalg.norm(0.5 * (stem.axis[1:] + stem.axis[:-1]) - point, axis=1)
+    j = int(np.argmin(np.where(stem.segment_lengths > 0.0, distance, np.inf)))
     direction: FloatArray = stem.axis[j + 1] - stem.axis[j]
     return direction
 

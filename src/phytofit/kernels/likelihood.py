@@ -10,7 +10,7 @@ __all__ = ["LEAF_COLUMNS", "STEM_COLUMNS", "log_density"]
 
 REACH = 5.5  # noise levels from a surface at which its density counts as none: e^-15 of the greatest
 LEAF_COLUMNS = 9  # of a leaf segment's change: translation (3), rotation (3), length, half widths at both ends
-STEM_COLUMNS = 8  # of the stem's: translation (3), rotation (3), length, radius
+STEM_COLUMNS = 8  # of a stem segment's: translation (3), rotation (3), length, radius
 ROOT_TWO = np.sqrt(2.0)
 ROOT_TWO_PI = np.sqrt(2.0 * np.pi)
 
@@ -73,7 +73,7 @@ def _between(low, high, std):
 def log_density(
     points, organ,
     leaf_origin, leaf_frame, leaf_length, leaf_half, leaf_density, leaf_change, leaf_area_change,
-    stem_origin, stem_frame, stem_length, radius, stem_change,
+    stem_origin, stem_frame, stem_length, stem_radius, stem_change, stem_area_change,
     noise, share, outlier_density,
     log_p, scores,
 ):  # fmt: skip
@@ -90,9 +90,11 @@ def log_density(
     leaf_origin (m, 3), leaf_frame (m, 3, 3) columns tangent, lateral, normal, leaf_length (m,), leaf_half (m + 1,) :
         the leaf's segments, and half widths at the nodes
     leaf_density (m,) : of points on each segment, relative to where all was seen
-    stem_origin (3,), stem_frame (3, 3) columns tangent and two across, stem_length, radius : the stem
-    leaf_change (m, k, 9), leaf_area_change (k,), stem_change (k, 8) : change of a segment, in its own frame, of the
-        logarithm of the leaf's area, and of the stem, for a unit change of each of k parameters
+    stem_origin (s, 3), stem_frame (s, 3, 3) columns tangent and two across, stem_length (s,), stem_radius (s,) : the
+        stem's segments
+    leaf_change (m, k, 9), leaf_area_change (k,), stem_change (s, k, 8), stem_area_change (k,) : change of a segment,
+        in its own frame, and of the logarithm of the organ's area, for a unit change of each
+        of k parameters
     noise : (3,) standard deviation: on the stem; on the leaf; and what its thickness adds to that across the blade
     share : (3,) of the points: stem, leaf, outliers
     outlier_density : of an outlier, per volume
@@ -102,7 +104,7 @@ def log_density(
     """
     n = points.shape[0]
     m = leaf_origin.shape[0]
-    k = stem_change.shape[0]
+    k = stem_change.shape[1]
     wanted = scores.shape[0] > 0
     stem_noise, leaf_noise, thickness = noise[0], noise[1], np.hypot(noise[1], noise[2])
     thin = (leaf_noise / thickness) ** 2
@@ -111,6 +113,9 @@ def log_density(
     area = 0.0
     for j in range(m):
         area += leaf_density[j] * leaf_length[j] * (leaf_half[j] + leaf_half[j + 1])
+    stem_area = 0.0
+    for j in range(len(stem_length)):
+        stem_area += stem_length[j] * stem_radius[j]
     floor = share[2] * outlier_density
     for i in range(n):
         on_stem = 0.0
@@ -119,41 +124,55 @@ def log_density(
             for c in range(k + 5):
                 scores[i, c] = 0.0
         if organ[i] != 1:
-            x, y, z = points[i, 0] - stem_origin[0], points[i, 1] - stem_origin[1], points[i, 2] - stem_origin[2]
-            u = stem_frame[0, 0] * x + stem_frame[1, 0] * y + stem_frame[2, 0] * z
-            v = stem_frame[0, 1] * x + stem_frame[1, 1] * y + stem_frame[2, 1] * z
-            w = stem_frame[0, 2] * x + stem_frame[1, 2] * y + stem_frame[2, 2] * z
-            rho = np.sqrt(v * v + w * w)
             far = REACH * stem_noise
-            if u > -far and u < stem_length + far and rho < radius + far and rho > radius - far:
-                along = _between(u - stem_length, u, stem_noise)
-                square = stem_noise * stem_noise
+            square = stem_noise * stem_noise
+            for j in range(len(stem_length)):
+                x, y, z = (
+                    points[i, 0] - stem_origin[j, 0],
+                    points[i, 1] - stem_origin[j, 1],
+                    points[i, 2] - stem_origin[j, 2],
+                )
+                u = stem_frame[j, 0, 0] * x + stem_frame[j, 1, 0] * y + stem_frame[j, 2, 0] * z
+                length, radius = stem_length[j], stem_radius[j]
+                if u < -far or u > length + far or length <= 0.0:
+                    continue
+                v = stem_frame[j, 0, 1] * x + stem_frame[j, 1, 1] * y + stem_frame[j, 2, 1] * z
+                w = stem_frame[j, 0, 2] * x + stem_frame[j, 1, 2] * y + stem_frame[j, 2, 2] * z
+                rho = np.sqrt(v * v + w * w)
+                if rho > radius + far or rho < radius - far:
+                    continue
+                along = _between(u - length, u, stem_noise)
+                if along <= 0.0:
+                    continue
                 bessel, ratio = _bessel(rho * radius / square)
                 gap = rho - radius
-                density = np.exp(-0.5 * gap * gap / square) * bessel / (2.0 * np.pi * square) * along / stem_length
-                on_stem = share[0] * density
-                if wanted and on_stem > 0.0:
-                    at_foot, at_top = _normal(u, stem_noise), _normal(u - stem_length, stem_noise)
+                around = np.exp(-0.5 * gap * gap / square) * bessel / (2.0 * np.pi * square)
+                density = share[0] * radius / stem_area * around * along
+                if density <= 0.0:
+                    continue
+                on_stem += density
+                if wanted:
+                    at_foot, at_top = _normal(u, stem_noise), _normal(u - length, stem_noise)
                     by_u = (at_foot - at_top) / along
-                    by_length = at_top / along - 1.0 / stem_length
+                    by_length = at_top / along
                     by_rho = (radius * ratio - rho) / square
-                    by_radius = (rho * ratio - radius) / square
+                    by_radius = (rho * ratio - radius) / square + 1.0 / radius
                     by_noise = (
                         -2.0
                         + (rho * rho + radius * radius - 2.0 * rho * radius * ratio) / square
-                        - (u * at_foot - (u - stem_length) * at_top) / along
+                        - (u * at_foot - (u - length) * at_top) / along
                     )
                     by_v = by_rho * v / rho if rho > 0.0 else 0.0
                     by_w = by_rho * w / rho if rho > 0.0 else 0.0
                     for c in range(k):
-                        change = stem_change[c]
+                        change = stem_change[j, c]
                         du = -change[0] - (change[4] * w - change[5] * v)
                         dv = -change[1] - (change[5] * u - change[3] * w)
                         dw = -change[2] - (change[3] * v - change[4] * u)
-                        scores[i, c] = on_stem * (
+                        scores[i, c] += density * (
                             by_u * du + by_v * dv + by_w * dw + by_length * change[6] + by_radius * change[7]
                         )
-                    scores[i, k] = on_stem * by_noise
+                    scores[i, k] += density * by_noise
         if organ[i] != 0:
             weight = share[1] / area
             for j in range(m):
@@ -224,7 +243,7 @@ def log_density(
         log_p[i] = np.log(p)
         if wanted:
             for c in range(k):
-                scores[i, c] = (scores[i, c] - on_leaf * leaf_area_change[c]) / p
+                scores[i, c] = (scores[i, c] - on_leaf * leaf_area_change[c] - on_stem * stem_area_change[c]) / p
             scores[i, k] /= p
             scores[i, k + 1] /= p
             scores[i, k + 2] /= p

@@ -10,6 +10,8 @@ from phytofit.models.organs import LEAF, STEM, Organ, frames_along
 __all__ = ["Phytomer"]
 
 FloatArray = NDArray[np.float64]
+COLLAR_CM = 0.5  # above and below the junction, where the stem's diameter changes, if it does
+UPRIGHT = frames_along(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.0, 1.0, 0.0]))
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Phytomer:
     leaf_base_width        share of the widest, at the base
     leaf_widest_at         share of the midrib, from its start; ``widest_share``
     leaf_taper             -     ``concavity``
+    stem_diameter_above    share of the stem's diameter, above the leaf: its sheath ends there
     ====================== ===== =================================================================================
     """
 
@@ -64,13 +67,14 @@ class Phytomer:
         "leaf_base_width",
         "leaf_widest_at",
         "leaf_taper",
+        "stem_diameter_above",
     )
-    UNITS = ("cm", "cm", "deg", "cm", "cm", "deg", "cm", "share", *["deg"] * 6, "share", "share", "1")
+    UNITS = ("cm", "cm", "deg", "cm", "cm", "deg", "cm", "share", *["deg"] * 6, "share", "share", "1", "share")
 
     @property
     def neutral(self) -> FloatArray:
         """Values (k,) of the parameters; those after the sixth give the paper's model."""
-        return np.array([*[np.nan] * 6, *[0.0] * 8, 1.0, self.widest_share, self.concavity])
+        return np.array([*[np.nan] * 6, *[0.0] * 8, 1.0, self.widest_share, self.concavity, 1.0])
 
     def width_profile(
         self, base: FloatArray | None = None, widest: FloatArray | None = None, taper: FloatArray | None = None
@@ -109,16 +113,19 @@ class Phytomer:
         n, given = xs.shape
         rest = np.broadcast_to(self.neutral[given:], (n, len(self.PARAMETERS) - given))
         diameter, below, leaf_angle, leaf_length, leaf_width, rotate, above, offset, *shape = np.hstack([xs, rest]).T
-        bow, wave, side_bend, side_bow, roll, twist, *profile = shape
-
-        stem_axis = np.zeros((n, 2, 3))
-        stem_axis[:, 1, 2] = below + above
-        stem = Organ(
-            STEM,
-            stem_axis,
-            frames_along(stem_axis, np.array([0.0, 1.0, 0.0])),
-            np.repeat(0.5 * diameter[:, np.newaxis], 2, axis=1),
-        )
+        bow, wave, side_bend, side_bow, roll, twist, *profile, ratio = shape
+        if given < len(self.PARAMETERS):
+            height, half_width = (
+                np.stack([0.0 * below, below + above], 1),
+                np.repeat(0.5 * diameter[:, np.newaxis], 2, 1),
+            )
+        else:  # one diameter goes over into the other around the junction
+            step = np.minimum(COLLAR_CM, 0.5 * np.minimum(below, above))
+            height = np.stack([0.0 * below, below - step, below + step, below + above], 1)
+            half_width = 0.5 * np.stack([diameter, diameter, diameter * ratio, diameter * ratio], 1)
+        stem_axis = np.zeros((*height.shape, 3))
+        stem_axis[..., 2] = height
+        stem = Organ(STEM, stem_axis, np.tile(UPRIGHT, (n, height.shape[1] - 1, 1, 1)), half_width)
 
         s = np.arange(self.n_pieces) / (self.n_pieces - 1)  # 0 at the first segment, 1 at the last
         hump, swing = 4.0 * s * (1.0 - s), 10.392304845413264 * s * (1.0 - s) * (1.0 - 2.0 * s)  # of height 1
@@ -137,7 +144,8 @@ class Phytomer:
         """The other parameters x (k,) of the same organs, seen upside down: ``turn @ x + offset``; k is 7 or more.
 
         Returns turn (k, k), offset (k,) and the pose (4, 4) from the other plant's frame to this one's.  Without what
-        is known of leaves (they leave the stem upwards and bend down) no cloud can tell the two apart.
+        is known of leaves (they leave the stem upwards and bend down) no cloud can tell the two apart.  Of plants near
+        x it is true to first order, where the stem has two diameters.
         """
         names = cls.PARAMETERS[: len(x)]
         turn = np.eye(len(x))
@@ -147,6 +155,15 @@ class Phytomer:
                 turn[names.index(name), names.index(name)] = -1.0
         offset = np.zeros(len(x))
         offset[2] = 180.0
+        if "stem_diameter_above" in names:
+            above = names.index("stem_diameter_above")
+            collar = names.index("collar_offset")
+            ratio = x[above]
+            other = x[0] * ratio, x[collar] / ratio, 1.0 / ratio
+            turn[0, [0, above]] = ratio, x[0]
+            turn[collar, [collar, above]] = 1.0 / ratio, -x[collar] / ratio**2
+            turn[above, above] = -1.0 / ratio**2
+            offset[[0, collar, above]] = other - (turn @ x)[[0, collar, above]]
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[2, 3] = x[1] + x[6]
         return turn, offset, pose

@@ -1,0 +1,122 @@
+"""Fits of what real plants do: blades on edge, leaves that hug the stem, sheaths, tips that bend away."""
+
+import numpy as np
+import pytest
+
+import phytofit
+from phytofit.posterior import _Cloud, _end, _lower_insertion, _turned_blade
+
+GENTLE = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 15.0}
+REAL = {"leaf_base_width": 0.5, "leaf_widest_at": 0.4, "leaf_bow": 10.0}
+WITHIN_STD = 4.0  # standard errors: one in 16,000 is further off
+SPECIES = phytofit.load_species()
+NAMES = phytofit.Phytomer.PARAMETERS
+
+
+def grown(seed=5, n_points=2500, noise_cm=0.3, **fixed):
+    return phytofit.simulate(fixed=GENTLE | REAL | fixed, n_points=n_points, noise_cm=noise_cm, seed=seed)
+
+
+def fitted(made, points=None):
+    return phytofit.fit(made.points if points is None else points, "cm", up=made.pose[:3, 2], threads=2)
+
+
+def trait(result, name):
+    return next(t for t in result.traits if t.name == name)
+
+
+def assert_held(made, result, *names):
+    true = {t.name: t.value for t in phytofit.measure(made.organs)}
+    for name in names:
+        found = trait(result, name)
+        assert abs(found.value - true[name]) < WITHIN_STD * (found.value - found.low) / 1.96, name
+
+
+@pytest.mark.parametrize("roll", [75.0, -75.0])
+def test_a_blade_on_edge(roll):
+    made = grown(leaf_roll=roll)
+    result = fitted(made)
+    assert_held(made, result, "leaf_length", "leaf_width", "stem_diameter")
+    assert trait(result, "leaf_width").value == pytest.approx(6.0, abs=0.5)
+
+
+def test_the_start_with_a_turned_blade_is_turned_as_the_points_lie():
+    made = grown(leaf_roll=60.0, leaf_twist=30.0)
+    plain = SPECIES.leading(7)
+    points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(made.x[:7], np.eye(4), 1.0)
+    (turned,) = _turned_blade(SPECIES, _end(plain, start, _Cloud(points, None, None)))
+    assert turned.x[NAMES.index("leaf_roll")] == pytest.approx(60.0, abs=15.0)
+    assert turned.x[NAMES.index("leaf_twist")] == pytest.approx(30.0, abs=25.0)
+
+
+def test_a_level_blade_is_not_begun_turned():
+    made = grown()
+    plain = SPECIES.leading(7)
+    points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(made.x[:7], np.eye(4), 1.0)
+    assert _turned_blade(SPECIES, _end(plain, start, _Cloud(points, None, None))) == []
+
+
+def test_a_sheath_that_ends_at_the_collar():
+    """The stem's diameter is that below the leaf, its sheath included."""
+    made = grown(stem_diameter_above=0.75, stem_length_above=12.0)
+    result = fitted(made)
+    i = NAMES.index("stem_diameter_above")
+    assert abs(result.x[i] - 0.75) < WITHIN_STD * np.sqrt(result.covariance[i, i])
+    assert_held(made, result, "stem_diameter", "leaf_length", "leaf_angle")
+    assert trait(result, "stem_diameter").value == pytest.approx(3.0, abs=0.1)
+
+
+def test_the_start_with_a_lower_insertion_moves_only_the_leafs_base():
+    made = grown()
+    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
+    (lower,) = _lower_insertion(SPECIES, likelihood.start(made.x, np.eye(4), 0.3))
+    assert lower.x[1] == pytest.approx(made.x[1] - 0.12 * made.x[3])
+    assert lower.x[1] + lower.x[6] == pytest.approx(made.x[1] + made.x[6])
+    before, after = (SPECIES.model.organs(x)[1].axis[0] for x in (made.x, lower.x))
+    gap = np.linalg.norm(before[8:, np.newaxis] - after, axis=2).min(axis=1)
+    assert np.median(gap) < 1.5  # cm; nodes are 2 cm apart
+    assert np.linalg.norm(after[0] - before[0]) > 5.0
+
+
+def test_a_leaf_that_hugs_the_stem_is_followed_down_to_its_insertion():
+    made = grown(leaf_angle=3.0, leaf_rotate_angle=4.5, collar_offset=1.0, leaf_bow=-8.0, leaf_base_width=0.9)
+    result = fitted(made)
+    assert trait(result, "leaf_length").value == pytest.approx(55.0, abs=2.5)
+
+
+def test_points_beyond_the_tip_are_flagged_and_open_the_length():
+    """A tip that bends away more sharply than the model can, here by 75 degrees at once."""
+    made = grown(leaf_length=60.0)
+    leaf = made.organs[1]
+    tip, frame = leaf.axis[-1], leaf.frame[-1]
+    away = np.cos(np.deg2rad(75.0)) * frame[:, 0] - np.sin(np.deg2rad(75.0)) * frame[:, 2]
+    random = np.random.default_rng(0)
+    piece = tip + random.uniform(1.0, 8.0, (120, 1)) * away + random.uniform(-0.8, 0.8, (120, 1)) * frame[:, 1]
+    result = fitted(made, np.concatenate([made.points, piece + random.normal(0.0, 0.2, piece.shape)]))
+    assert any("near the leaf's tip are not explained" in flag for flag in result.flags)
+    assert trait(result, "leaf_length").high is None
+
+
+def test_outliers_all_over_are_not_points_beyond_the_tip():
+    made = grown()
+    stray = phytofit.add_outliers(made.points, 0.15, np.random.default_rng(2))
+    result = fitted(made, np.concatenate([made.points, stray]))
+    assert result.estimate.sighting.beyond == 0.0
+
+
+def test_a_length_without_its_tip_is_at_least_what_was_seen():
+    made = grown(n_points=4000)
+    leaf = made.organs[1]
+    nearest = np.argmin(np.linalg.norm(made.points[:, np.newaxis] - leaf.axis, axis=2), axis=1)
+    result = fitted(made, made.points[nearest <= 22])
+    length = trait(result, "leaf_length")
+    assert result.estimate.seen < 1.0
+    assert length.high is None
+    assert 0.6 * 55.0 < length.low < length.value - (1.0 - result.estimate.seen) * result.parameters["leaf_length"]
+
+
+def test_a_stem_no_thicker_than_its_scatter_is_flagged():
+    made = grown(stem_diameter=1.0, noise_cm=0.45)
+    assert any("scatter by half its radius" in flag for flag in fitted(made).flags)
