@@ -83,7 +83,7 @@ class PaperObjective:
         iterations: int = 20,
         tolerance_cm: float = 1e-3,
         memory: int = 5,
-        tilts_deg: tuple[float, ...] = (9.0, -9.0),
+        tilts_deg: tuple[float, ...] = (9.0, -9.0, 18.0, -18.0),
         seed: int = 0,
         executor: Executor | None = None,
     ) -> None:
