@@ -120,3 +120,11 @@ def test_a_length_without_its_tip_is_at_least_what_was_seen():
 def test_a_stem_no_thicker_than_its_scatter_is_flagged():
     made = grown(stem_diameter=1.0, noise_cm=0.45)
     assert any("scatter by half its radius" in flag for flag in fitted(made).flags)
+
+
+@pytest.mark.parametrize("k", range(8, 19))
+def test_a_species_with_any_number_of_parameters(k):
+    made = grown(leaf_angle=10.0, collar_offset=1.0, n_points=1200)
+    result = phytofit.fit(made.points, "cm", species=SPECIES.leading(k), up=made.pose[:3, 2], threads=2)
+    assert len(result.x) in (7, k)
+    assert trait(result, "leaf_length").value == pytest.approx(55.0, abs=4.0)

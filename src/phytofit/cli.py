@@ -58,6 +58,13 @@ def fit_command(
     ] = None,
     species: SpeciesOption = FIT["species"],
     up: Annotated[str | None, typer.Option(help=f"Upward direction where it is known: {', '.join(AXES)}.")] = None,
+    seed_point: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="A point on the leaf that is meant, where the cloud shows others too; repeat for a leaf in pieces.",
+        ),
+    ] = None,
     method: Annotated[
         str,
         typer.Option(
@@ -103,13 +110,17 @@ def fit_command(
         phytofit fit leaf.ply --units cm
 
         phytofit fit scans/*.ply --units mm --up z --out results
+
+        phytofit fit crowded.ply --units cm --seed-point 12.5,-3,40
     """
+    seed_points = _or_exit(lambda: _seed_points(seed_point or [], len(clouds)))
     chosen = _or_exit(lambda: load_species(species))
     _or_exit(lambda: prepare_folder(folder))
     _or_exit(lambda: parse_up(up))
     settings: dict[str, Any] = {
         "species": chosen,
         "up": up,
+        "seed_point": seed_points,
         "method": method,
         "distance": distance,
         "n_samples": samples,
@@ -138,6 +149,18 @@ def fit_command(
         _or_exit(lambda: write_text(folder / "traits.csv", table_text(pd.concat(tables))))
         out.print(f"{len(tables)} of {len(clouds)} clouds measured: {folder / 'traits.csv'}", highlight=False)
     raise typer.Exit(0 if len(tables) == len(clouds) else 1 if tables else 2)
+
+
+def _seed_points(given: list[str], n_clouds: int) -> list[list[float]] | None:
+    if given and n_clouds > 1:
+        raise SettingError(f"--seed-point: expected with one cloud, as it is a place in it; got {n_clouds} clouds")
+    try:
+        points = [[float(number) for number in text.split(",")] for text in given]
+    except ValueError:
+        raise SettingError(f"--seed-point: expected X,Y,Z, got {', '.join(given)!r}") from None
+    if any(len(point) != 3 for point in points):
+        raise SettingError(f"--seed-point: expected X,Y,Z, got {', '.join(given)!r}")
+    return points or None
 
 
 @app.command("simulate")

@@ -186,12 +186,24 @@ def parse_up(up: str | ArrayLike | None) -> FloatArray | None:
     return unit
 
 
+def _parse_points(points: ArrayLike) -> FloatArray:
+    """(k, 3) of one or more points."""
+    try:
+        rows = np.atleast_2d(np.asarray(points, float))
+    except ValueError:
+        rows = np.empty((0, 0))
+    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
+        raise SettingError(f"seed_point: expected three numbers, or several times three, got {points!r}")
+    return rows
+
+
 def fit(
     cloud: PointCloud | ArrayLike,
     units: str | None = None,
     *,
     species: Species | str | os.PathLike[str] = "sorghum",
     up: str | ArrayLike | None = None,
+    seed_point: ArrayLike | None = None,
     method: str = "likelihood",
     distance: str | None = None,
     n_samples: int | None = None,
@@ -213,6 +225,8 @@ def fit(
     units : "cm", "mm", "m", or "none" for relative lengths; needed for bare points
     species : name of a species that comes with phytofit, a TOML file, or a Species
     up : "x", "-x", .. "-z" or a vector, where the upward direction is known
+    seed_point : (3,) or (k, 3) in the cloud's unit, on the leaf that is meant, where the cloud shows others as well:
+        beside the stem, what is not connected with it is left out; one for each piece of a leaf in pieces
     method : "likelihood", the most probable phytomer, with intervals; or "paper", the cross-entropy search of Sodhi et
         al., IROS 2018, for the least distance between the clouds
     distance : what the paper's method minimises: hausdorff (its own), quantile, chamfer, labels
@@ -239,6 +253,7 @@ def fit(
         if value is not None and value < least:
             raise SettingError(f"{name}: expected {least} or more, got {value}")
     direction = parse_up(up)
+    seed_points = None if seed_point is None else _parse_points(seed_point)
     species = species if isinstance(species, Species) else load_species(os.fspath(species))
     if not isinstance(cloud, PointCloud):
         cloud = from_points(cloud, units)
@@ -251,7 +266,9 @@ def fit(
     CrossEntropy(species.space, **{name: value for name, value in used.items() if name in SEARCH})  # checks them
     if not stem_above:
         species = species.leading(N_PAPER)
-    found = prepare(cloud, species, n_points=n_points, up=direction, with_outliers=method == "likelihood")
+    found = prepare(
+        cloud, species, n_points=n_points, up=direction, with_outliers=method == "likelihood", seed_points=seed_points
+    )
     means = [mean_at(start, species.leading(N_SEARCHED).space) for start in found.starts]
     if random_start:
         means[0] = _random_mean(species.leading(N_SEARCHED).space, seed)
@@ -277,6 +294,7 @@ def fit(
             "random_start": random_start,
             "stem_above": stem_above,
             "up": None if direction is None else direction.tolist(),
+            "seed_point": None if seed_points is None else seed_points.tolist(),
         },
     )
     return _remarked(_right_way_up(result, direction))

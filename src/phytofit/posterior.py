@@ -29,7 +29,7 @@ START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some
 CUT_SHARE = 0.85  # of the midrib, from which the search for a missing tip starts
 DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
-SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its ten parameters gain five by chance, and cost more
+SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its eleven parameters gain five by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
 TURNED = 30.0  # degrees from level, from which a blade is also begun turned
@@ -207,6 +207,9 @@ def _candidates(plain: Species, species: Species, cloud: _Cloud, state: State) -
 def _turned_blade(species: Species, end: _End) -> list[State]:
     """The state with its blade turned about the midrib as the leaf's points lie across it, where that is far from
     level: a blade on edge is a local optimum of a level one."""
+    names = species.space.names
+    if "leaf_twist" not in names:
+        return []
     likelihood, state = end.likelihood, end.state
     at = likelihood.evaluate(state)
     on_leaf = 1.0 - at.scores[:, -2] - state.share[0] - at.scores[:, -1] - state.share[2] > 0.5
@@ -225,7 +228,6 @@ def _turned_blade(species: Species, end: _End) -> list[State]:
     if max(abs(turn)) < TURNED:
         return []
     theta = state.theta.copy()
-    names = species.space.names
     x = np.concatenate([state.x, species.space.mean[state.n_parameters :]])
     x[names.index("leaf_roll")], x[names.index("leaf_twist")] = roll, twist
     x[names.index("leaf_width")] = 2.0 * np.sqrt(3.0) * spread[:, 1].max()  # as of a uniform strip
@@ -243,9 +245,8 @@ def _lower_insertion(species: Species, state: State) -> list[State]:
         return []
     tip = np.linspace(0.0, (1.0 - LOWER) * x[3], 12)  # lengths from the tip, at which the leaf stays where it is
     nodes = np.linspace(1.0, 0.0, species.model.n_pieces + 1)
-    changed = [
-        space.index(name) for name in ("leaf_angle", "leaf_length", "leaf_rotate_angle", "leaf_bow", "leaf_wave")
-    ]
+    bent = ("leaf_angle", "leaf_length", "leaf_rotate_angle", "leaf_bow", "leaf_wave")
+    changed = [space.index(name) for name in bent if name in space.names]
 
     def midrib(x: FloatArray) -> FloatArray:
         axis = species.model.organs(x)[1].axis[0][::-1]
@@ -264,7 +265,8 @@ def _lower_insertion(species: Species, state: State) -> list[State]:
         residuals: FloatArray = np.concatenate([(midrib(lowered(values)) - there).ravel(), PRIOR_CM * surprise])
         return residuals
 
-    begun = x[changed] + [-0.5 * x[2], drop, 0.0, 0.0, 0.0]
+    begun = x[changed]
+    begun[:2] += -0.5 * x[2], drop
     found = lowered(least_squares(misfit, begun, method="lm", x_scale=space.std[changed]).x)
     return [State(np.concatenate([found, state.theta[k:]]), state.pose, state.center)]
 

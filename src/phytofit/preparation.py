@@ -4,14 +4,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from phytofit.cloud import PointCloud, remove_outliers, size_cm, thin
+from phytofit.errors import SettingError
 from phytofit.pose import StartPose, start_poses
 from phytofit.species import Species
 
 __all__ = ["Prepared", "prepare"]
 
 FloatArray = NDArray[np.float64]
+STEM_MARGIN, STEM_MARGIN_CM = 1.3, 0.5  # of its radius, and more, around a stem within which points are the stem's
+LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
+NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
 
 
@@ -43,18 +50,27 @@ def prepare(
     n_points: int = 5000,
     up: FloatArray | None = None,
     with_outliers: bool = False,
+    seed_points: FloatArray | None = None,
 ) -> Prepared:
     """Clean a cloud, find where its stem stands, and thin it as it looks from there.
 
     The stem is looked for without outliers; `with_outliers` keeps them for the fit, in case that it accounts for them,
     and then thins the cloud at random: one point a voxel would change how points are spread around a surface.
     The coordinates are rounded, so that a rotated copy of the cloud gives the same numbers.
+
+    seed_points : (k, 3) in the cloud's unit, on the leaf that is meant: beside the stem only points count that are
+        connected with one of them
     """
     clean = used = cloud.take(remove_outliers(cloud.points))
     if with_outliers:
         used = cloud
     scale = size_cm(clean.points) / _expected_size(species) if cloud.unit == "none" else 1.0
     starts = start_poses(clean.points / scale, _largest_stem_radius(species), up=up)
+    if seed_points is not None:
+        meant = cloud.take(np.flatnonzero(_meant(cloud.points / scale, starts[0], seed_points / scale)))
+        found = prepare(meant, species, n_points=n_points, up=up, with_outliers=with_outliers)
+        left_out = f"{len(cloud) - len(meant)} of {len(cloud)} points left out: not connected with a seed point"
+        return replace(found, notes=(left_out, *found.notes))
     home = starts[0].pose
     upright = np.round((used.points / scale - home[:3, 3]) @ home[:3, :3], CANONICAL_DECIMALS)
     kept = _some(len(upright), n_points) if with_outliers else thin(upright, n_points)
@@ -70,6 +86,28 @@ def prepare(
         scale=scale,
         notes=tuple(_what_was_left_out(len(cloud), len(used), len(kept))),
     )
+
+
+def _meant(points: FloatArray, start: StartPose, seed_points: FloatArray) -> NDArray[np.bool_]:
+    """Which points (n, 3) are of the stem, or of what is connected with the seed points (k, 3) beside it, cm."""
+    upright = (points - start.pose[:3, 3]) @ start.pose[:3, :3]
+    margin = STEM_MARGIN * start.radius + STEM_MARGIN_CM
+    on_stem = np.hypot(upright[:, 0], upright[:, 1]) < margin
+    on_stem &= (upright[:, 2] > start.foot - margin) & (upright[:, 2] < start.top + margin)
+    beside = np.flatnonzero(~on_stem)
+    tree = cKDTree(points[beside])
+    gap, nearest = tree.query(seed_points)
+    if np.any(gap > NEAREST_CM):
+        raise SettingError(
+            f"seed_point: expected a point within {NEAREST_CM:g} cm of a leaf's, found none for "
+            f"{seed_points[np.argmax(gap)].round(2).tolist()} cm; the nearest is {gap.max():.1f} cm away"
+        )
+    typical = float(np.median(tree.query(points[beside], k=min(LINK_NEIGHBOR, len(beside)))[0][:, -1]))
+    links = tree.query_pairs(max(LINK * typical, LEAST_LINK_CM), output_type="ndarray")
+    graph = coo_array((np.ones(len(links), bool), links.T), shape=(len(beside), len(beside)))
+    piece = connected_components(graph, directed=False)[1]
+    on_stem[beside[np.isin(piece, piece[nearest])]] = True
+    return on_stem
 
 
 def _some(n: int, n_wanted: int) -> NDArray[np.intp]:

@@ -1,0 +1,84 @@
+"""Which leaf is meant, in a cloud that shows others too."""
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import phytofit
+from phytofit.cli import app
+
+FIXED = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 15.0}
+LENGTH_CM = 1.5
+
+
+@pytest.fixture(scope="module")
+def crowded():
+    """A phytomer, a leaf of the same stem on its other side, a leaf that hangs free, and a piece of wall behind."""
+    made = phytofit.simulate(fixed=FIXED, n_points=3000, noise_cm=0.3, seed=4)
+    upright = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    leaf = upright[made.labels == 2]
+    random = np.random.default_rng(4)
+    opposite = leaf * [-1.0, -1.0, 1.0] + [0.0, 0.0, -7.0]
+    free = leaf[leaf[:, 0] > 12.0] + [-4.0, 15.0, 6.0]
+    wall = random.uniform([-25.0, -22.0, 0.0], [35.0, -20.0, 30.0], (800, 3))
+    every = np.concatenate([upright, opposite[::2], free[::2], wall])
+    on_leaf = made.organs[1].axis[15]
+    return made, every @ made.pose[:3, :3].T + made.pose[:3, 3], on_leaf
+
+
+def length_of(result):
+    return next(t.value for t in result.traits if t.name == "leaf_length")
+
+
+def test_only_the_leaf_that_is_meant_is_measured(crowded):
+    made, points, on_leaf = crowded
+    result = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
+    assert length_of(result) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
+    assert any("not connected with a seed point" in note for note in result.notes)
+    assert len(result.reference) < len(points) - 1500
+    alone = phytofit.fit(made.points, "cm", up=made.pose[:3, 2], threads=2)
+    assert length_of(result) == pytest.approx(length_of(alone), abs=LENGTH_CM)
+
+
+def test_a_seed_point_of_a_whole_phytomer_changes_little(crowded):
+    made, _, on_leaf = crowded
+    with_seed = phytofit.fit(made.points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
+    without = phytofit.fit(made.points, "cm", up=made.pose[:3, 2], threads=2)
+    assert length_of(with_seed) == pytest.approx(length_of(without), abs=0.5)
+
+
+def test_two_pieces_of_a_leaf(crowded):
+    made, _, _ = crowded
+    middle, far = made.organs[1].axis[[10, 24]]
+    gap = np.abs((made.points - made.organs[1].axis[17]) @ made.organs[1].frame[17, :, 0]) < 4.0
+    points = made.points[~gap | (made.labels == 1)]
+    both = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=[middle, far], threads=2)
+    assert length_of(both) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
+    one = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=middle, threads=2)
+    assert len(one.reference) < len(both.reference)
+
+
+@pytest.mark.parametrize("wrong", ["abc", [1.0, 2.0], [[1.0, 2.0, np.nan]], [[[1.0, 2.0, 3.0]]]])
+def test_what_is_no_point_is_refused(crowded, wrong):
+    with pytest.raises(phytofit.SettingError, match="seed_point: expected three numbers"):
+        phytofit.fit(crowded[0].points, "cm", seed_point=wrong)
+
+
+def test_a_point_far_from_every_leaf_is_refused(crowded):
+    with pytest.raises(phytofit.SettingError, match=r"the nearest is .* cm away"):
+        phytofit.fit(crowded[0].points, "cm", seed_point=[500.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--seed-point", "1,2"], "expected X,Y,Z"),
+        (["--seed-point", "1,2,x"], "expected X,Y,Z"),
+        (["other.ply", "--seed-point", "1,2,3"], "one cloud"),
+    ],
+)
+def test_the_command_says_what_it_expects(tmp_path, arguments, says):
+    done = CliRunner().invoke(app, ["fit", "cloud.ply", *arguments, "--units", "cm", "--out", str(tmp_path)])
+    assert done.exit_code == 2
+    assert says in " ".join(done.output.split())
+    assert not list(tmp_path.iterdir())
