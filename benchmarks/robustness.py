@@ -1,11 +1,12 @@
 """Where the default method stops working, and whether its flags say so first.
 
-    python benchmarks/robustness.py [field] [sweeps] [--phytomers 20]
+    python benchmarks/robustness.py [field] [sweeps] [--phytomers 20] [--no-peers]
 
 field    the paper's two data sets (Fig. 7): a field phytomer with 0.5 cm noise added, or without the points in a
          sphere of 6 cm; 50 copies each, from random starting means: leaf length beside that of the untouched cloud
-sweeps   simulated phytomers made worse step by step: noise, holes, a missing tip, outliers, one viewpoint, few points;
-         errors, coverage of the 95 % intervals and flags; plotted in docs/images/robustness.png
+sweeps   simulated phytomers made worse step by step: noise, holes, a missing tip, outliers, one viewpoint, few points,
+         leaves of others; errors, coverage of the 95 % intervals and flags, and the errors of the paper's method and of
+         model_free.py on the same clouds; plotted in docs/images/robustness.png
 """
 
 import argparse
@@ -20,6 +21,7 @@ from typing import NamedTuple
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thread
 
+import model_free
 import numpy as np
 from accuracy import DATA, progress
 from matplotlib.figure import Figure
@@ -42,15 +44,18 @@ class Sweep(NamedTuple):
     cloud: Callable[[phytofit.SimulatedPhytomer, float, np.random.Generator], np.ndarray]
     noise_cm: float = 0.5
     n_points: int = 5000
+    seeded: bool = False  # told by a seed point which leaf is meant
 
 
 class Outcome(NamedTuple):
-    """Errors and coverage (4,) of `TRAITS`, NaN where there is none; flags; False if no phytomer was found."""
+    """Errors and coverage (4,) of `TRAITS`, NaN where there is none; flags; False if no phytomer was found; errors of
+    leaf length of the paper's method and of the baseline without a model."""
 
     error: np.ndarray
     covered: np.ndarray
     flags: tuple[str, ...]
     found: bool
+    peers: tuple[float, float]
 
 
 def along_leaf(made: phytofit.SimulatedPhytomer) -> np.ndarray:
@@ -109,6 +114,23 @@ def fewer(made: phytofit.SimulatedPhytomer, n_points: float, random: np.random.G
     return made.points[random.permutation(len(made.points))[: int(n_points)]]
 
 
+def among_others(made: phytofit.SimulatedPhytomer, n_leaves: float, random: np.random.Generator) -> np.ndarray:
+    """With leaves of others at the same stem, at least 60 degrees to the side, and a piece of wall behind."""
+    upright = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    parts = [upright]
+    for _ in range(int(n_leaves)):
+        other = phytofit.simulate(SPECIES, n_points=3000, noise_cm=0.5, seed=int(random.integers(2**31)))
+        leaf = ((other.points - other.pose[:3, 3]) @ other.pose[:3, :3])[other.labels == 2]
+        turn = np.deg2rad(random.uniform(60.0, 300.0))
+        c, s = np.cos(turn), np.sin(turn)
+        leaf[:, 2] += random.uniform(0.0, made.organs[0].segment_lengths.sum()) - other.x[1]
+        parts.append(leaf @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
+    if n_leaves:
+        side = 40.0 * (1.0 if random.random() < 0.5 else -1.0)
+        parts.append(random.uniform([-20.0, side - 1.0, 0.0], [40.0, side + 1.0, 40.0], (500, 3)))
+    return np.concatenate(parts) @ made.pose[:3, :3].T + made.pose[:3, 3]
+
+
 SWEEPS = {
     "noise": Sweep("cm", (0.1, 0.25, 0.5, 1.0, 1.5, 2.0), with_noise, noise_cm=0.0),
     "leaf removed": Sweep("share", (0.0, 0.1, 0.2, 0.4, 0.6), with_holes),
@@ -116,41 +138,71 @@ SWEEPS = {
     "outliers": Sweep("share of the points", (0.0, 0.1, 0.2, 0.3, 0.4), with_outliers),
     "views": Sweep("cameras around the plant", (1.0, 2.0, 3.0, 6.0), from_one_side),
     "points": Sweep("number", (300.0, 1000.0, 2500.0, 5000.0), fewer),
+    "leaves of others": Sweep("number, and a wall", (0.0, 1.0, 2.0, 4.0), among_others, seeded=True),
 }
 
 
-def measured(job: tuple[str, float, int]) -> Outcome:
-    name, step, number = job
+def measured(job: tuple[str, float, int, bool]) -> Outcome:
+    name, step, number, with_peers = job
     sweep = SWEEPS[name]
     made = phytofit.simulate(SPECIES, n_points=sweep.n_points, noise_cm=sweep.noise_cm, seed=FIRST_SEED + number)
     points = sweep.cloud(made, step, np.random.default_rng(number))
+    seed_point = made.organs[1].axis[12] if sweep.seeded else None
     true = {t.name: t.value for t in phytofit.measure(made.organs)}
+    peers = peer_errors(points, seed_point, true["leaf_length"]) if with_peers else (np.nan, np.nan)
     try:
-        result = phytofit.fit(points, "cm", threads=1)
-    except phytofit.NoPhytomerError as refused:
-        return Outcome(np.full(len(TRAITS), np.nan), np.full(len(TRAITS), np.nan), (str(refused),), False)
+        result = phytofit.fit(points, "cm", seed_point=seed_point, threads=1)
+    except phytofit.PhytofitError as refused:
+        none = np.full(len(TRAITS), np.nan)
+        return Outcome(none, none, (str(refused),), False, peers)
     traits = {t.name: t for t in result.traits}
     return Outcome(
         np.array([traits[name].value - true[name] for name in TRAITS]),
         np.array([covers(traits[name], true[name]) for name in TRAITS]),
         result.flags,
         True,
+        peers,
     )
 
 
-def sweeps(pool: ProcessPoolExecutor, phytomers: int) -> None:
-    jobs = [(name, step, i) for name, sweep in SWEEPS.items() for step in sweep.steps for i in range(phytomers)]
+def peer_errors(points: np.ndarray, seed_point: np.ndarray | None, length: float) -> tuple[float, float]:
+    """Errors of leaf length of the paper's method and of the baseline without a model, NaN where they find none."""
+
+    def paper() -> float:
+        result = phytofit.fit(points, "cm", seed_point=seed_point, method="paper", threads=1)
+        return next(t.value for t in result.traits if t.name == "leaf_length")
+
+    errors = []
+    for peer in (paper, lambda: model_free.measure(points, seed_point)["leaf_length"]):
+        try:
+            errors.append(peer() - length)
+        except phytofit.PhytofitError:
+            errors.append(np.nan)
+    return errors[0], errors[1]
+
+
+def sweeps(pool: ProcessPoolExecutor, phytomers: int, with_peers: bool) -> None:
+    jobs = [
+        (name, step, i, with_peers) for name, sweep in SWEEPS.items() for step in sweep.steps for i in range(phytomers)
+    ]
     outcomes = defaultdict(list)
     for job, outcome in zip(jobs, progress(pool.map(measured, jobs, chunksize=1), len(jobs)), strict=True):
         outcomes[job[:2]].append(outcome)
     print(
         f"\n{phytomers} simulated phytomers a step: median absolute error (95th percentile) of those that were found;"
     )
-    print("coverage of the 95 % intervals over the four traits: of all, of the unflagged")
-    figure = Figure(figsize=(13.0, 7.0), layout="constrained")
-    for ax, (name, sweep) in zip(figure.subplots(2, 3).ravel(), SWEEPS.items(), strict=True):
+    print("coverage of the 95 % intervals over the four traits: of all, of the unflagged; last, leaf length by the")
+    print("paper's method and by the baseline without a model: median absolute error of those that found one")
+    figure = Figure(figsize=(17.0, 7.0), layout="constrained")
+    axes = figure.subplots(2, 4).ravel()
+    axes[-1].axis("off")
+    for ax, (name, sweep) in zip(axes, SWEEPS.items(), strict=False):
         print(f"\n{name}, {sweep.unit}")
-        print(f"{'':>8}" + "".join(f"{trait:>18}" for trait in TRAITS) + "   covered  unflagged   flagged  refused")
+        print(
+            f"{'':>8}"
+            + "".join(f"{trait:>18}" for trait in TRAITS)
+            + "   covered  unflagged   flagged  refused    paper's  model-free"
+        )
         shown = []
         for step in sweep.steps:
             those = outcomes[name, step]
@@ -162,30 +214,38 @@ def sweeps(pool: ProcessPoolExecutor, phytomers: int) -> None:
             median, most = (np.quantile(errors, q, axis=0) if len(errors) else np.full(4, np.nan) for q in (0.5, 0.95))
             cells = "".join(f"{a:9.2f} ({b:6.2f})" for a, b in zip(median, most, strict=True))
             held = [100 * np.nanmean(c) if len(c) else np.nan for c in (covered, plain)]
-            print(f"{step:8g}{cells}{held[0]:8.0f} %{held[1]:9.0f} %{100 * flagged:8.0f} %{refused:9}", flush=True)
-            shown.append((median[0], held[0], 100 * flagged))
-        draw(ax, name, sweep, np.array(shown))
+            others = np.nanmedian(np.abs([o.peers for o in those]), axis=0) if with_peers else np.full(2, np.nan)
+            print(
+                f"{step:8g}{cells}{held[0]:8.0f} %{held[1]:9.0f} %{100 * flagged:8.0f} %{refused:9}"
+                f"{others[0]:11.2f}{others[1]:12.2f}",
+                flush=True,
+            )
+            shown.append((median[0], held[0], 100 * flagged, *others))
+        lines = draw(ax, name, sweep, np.array(shown))
+    axes[-1].legend(lines, [line.get_label() for line in lines], fontsize=10, loc="center")
     PICTURE.parent.mkdir(exist_ok=True)
     figure.savefig(PICTURE, dpi=110)
     print(f"\nplotted: {PICTURE.relative_to(PICTURE.parents[2])}")
 
 
-def draw(ax, name: str, sweep: Sweep, shown: np.ndarray) -> None:  # type: ignore[no-untyped-def]
+def draw(ax, name: str, sweep: Sweep, shown: np.ndarray) -> list:  # type: ignore[no-untyped-def,type-arg]
     x = np.arange(len(sweep.steps))
+    ax.plot(x, shown[:, 3], color="0.45", marker="v", lw=1.0, label="the same by the paper's method")
+    ax.plot(x, shown[:, 4], color="0.7", marker="x", lw=1.0, label="the same without a model (model_free.py)")
     ax.plot(x, shown[:, 0], color="#0072B2", marker="o", label="leaf length: median absolute error, cm")
     ax.set_xticks(x, [f"{step:g}" for step in sweep.steps])
     ax.set_xlabel(f"{name} ({sweep.unit})")
     ax.set_ylabel("error, cm")
-    ax.set_ylim(bottom=0.0)
+    ax.set_yscale("symlog", linthresh=1.0)
+    ax.set_yticks([0.0, 0.5, 1.0, 3.0, 10.0, 30.0], ["0", "0.5", "1", "3", "10", "30"])
+    ax.set_ylim(0.0, 60.0)
     ax.grid(alpha=0.25)
     other = ax.twinx()
     other.plot(x, shown[:, 1], color="#D55E00", marker="s", ls="--", label="true value within the interval, %")
     other.plot(x, shown[:, 2], color="#009E73", marker="^", ls=":", label="flagged, %")
     other.set_ylim(-3.0, 103.0)
     other.set_ylabel("%")
-    if name == "noise":
-        lines = [*ax.get_lines(), *other.get_lines()]
-        ax.legend(lines, [line.get_label() for line in lines], fontsize=8, loc="center left")
+    return [*ax.get_lines(), *other.get_lines()]
 
 
 def field_length(job: tuple[str, int]) -> tuple[float, float, float, bool, float]:
@@ -229,8 +289,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", default=[], help="field, sweeps; both by default")
     parser.add_argument("--phytomers", type=int, default=20)
+    parser.add_argument(
+        "--no-peers", action="store_true", help="without the other methods, which take most of the time"
+    )
     arguments = parser.parse_args()
-    parts = {"field": field, "sweeps": lambda pool: sweeps(pool, arguments.phytomers)}
+    parts = {"field": field, "sweeps": lambda pool: sweeps(pool, arguments.phytomers, not arguments.no_peers)}
     unknown = set(arguments.parts) - set(parts)
     if unknown:
         sys.exit(f"no part is called {', '.join(unknown)}; there are {', '.join(parts)}")

@@ -1,6 +1,6 @@
 """The benchmarks run; their yardstick is plain ICP."""
 
-import importlib.util
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
+
+import phytofit
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SAME = 1e-9  # cm; the same sums in the same order
@@ -27,11 +29,14 @@ def brute_hausdorff(points, reference):
     return max(distance.min(axis=0).max(), distance.min(axis=1).max())
 
 
+def load(name):
+    if str(BENCHMARKS) not in sys.path:
+        sys.path.insert(0, str(BENCHMARKS))
+    return importlib.import_module(name)
+
+
 def load_peers():
-    spec = importlib.util.spec_from_file_location("peers", BENCHMARKS / "peers.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return load("peers")
 
 
 @pytest.fixture
@@ -102,3 +107,37 @@ def test_peers_align_alike(clouds):
         assert 1 <= rounds <= 50
         assert peer.distance(points, np.eye(4)) == pytest.approx(brute_hausdorff(points, reference), abs=SAME)
         assert make(reference).align(source, start, 1)[1] == 1
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_baseline_without_a_model_measures_a_clean_cloud(seed):
+    made = phytofit.simulate(noise_cm=0.1, seed=seed)
+    found = load("model_free").measure(made.points)
+    true = {t.name: t.value for t in phytofit.measure(made.organs)}
+    assert found["leaf_length"] == pytest.approx(true["leaf_length"], abs=3.0)
+    assert found["stem_diameter"] == pytest.approx(true["stem_diameter"], abs=0.2)
+    assert found["leaf_width"] == pytest.approx(true["leaf_width"], rel=0.15)
+    assert found["leaf_angle"] == pytest.approx(true["leaf_angle"], abs=12.0)
+
+
+@pytest.mark.skipif(not (BENCHMARKS / "../../shared/data/openalea_synthetic_maize").is_dir(), reason="no data")
+def test_maize_leaves_lie_along_their_true_organs():
+    """Noise of 0.3 cm: every point of a leaf within 2 cm of the midrib's half width, or of the stem's surface."""
+    leaves = load("trust").maize_leaves(n_points=600)
+    assert len(leaves) > 15
+    for leaf in leaves:
+        stem, blade = leaf.organs
+        assert len(leaf.points) == 600
+        near = np.linalg.norm(leaf.points[:, np.newaxis] - blade.axis, axis=2).min(axis=1)
+        rho = np.hypot(leaf.points[:, 0], leaf.points[:, 1])
+        assert np.all((near < blade.half_width.max() + 2.0) | (rho < stem.half_width.max() + 1.5)), leaf.name
+        assert 10.0 < blade.segment_lengths.sum() < 130.0
+
+
+@pytest.mark.long
+def test_robustness_benchmark_measures_each_step():
+    robustness = load("robustness")
+    for name, sweep in robustness.SWEEPS.items():
+        outcome = robustness.measured((name, sweep.steps[0], 0, True))
+        assert outcome.found, name
+        assert np.all(np.isfinite(outcome.peers)), name

@@ -70,7 +70,7 @@ def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0
     log_p = np.empty(n)
     log_density(
         np.array(points, float), np.full(n, organ, np.int8),
-        leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, np.ones(m), np.zeros((m, 0, 9)),
+        leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, np.ones((m, 3)), np.zeros((m, 0, 9)),
         np.zeros(0),
         stem.axis[:-1], stem.frame, stem.segment_lengths, 0.5 * (stem.half_width[1:] + stem.half_width[:-1]),
         np.zeros((len(stem.frame), 0, 8)), np.zeros(0),
@@ -380,22 +380,22 @@ def test_the_likelihood_of_a_state_is_the_density_of_its_organs(cut):
         np.testing.assert_allclose(np.exp(likelihood.evaluate(state).log_p[one]), expected, rtol=1e-8)
 
 
-def test_the_density_along_a_leaf_weighs_its_pieces():
-    """A leaf is the mixture of its pieces by area and density; and the scores are the slopes still."""
+def test_the_density_over_a_leaf_weighs_its_strips():
+    """A leaf is the mixture of its strips by area and density; and the scores are the slopes still."""
     likelihood, state = scene(SHAPED, 8, n=60)
     state = disturbed(likelihood, state, np.random.default_rng(8))
     state.theta[-1] = -9.0
-    weight = np.random.default_rng(9).uniform(0.1, 1.0, 30)
+    weight = np.random.default_rng(9).uniform(0.1, 1.0, (30, 3))
     likelihood.organ = np.ones(60, np.int8)
     likelihood.density = weight
     leaf = grow(state.x)[1]
-    area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
+    area = np.repeat(leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1]) / 3.0, 3)
     parts = []
-    for j in range(30):
-        likelihood.density = np.eye(30)[j]
+    for one in np.eye(90):
+        likelihood.density = one.reshape(30, 3)
         parts.append(np.exp(likelihood.evaluate(state, derivatives=False).log_p))
     outliers = state.share[2] / ConvexHull(likelihood.points).volume
-    expected = (weight * area) @ (np.array(parts) - outliers) / (weight @ area) + outliers
+    expected = (weight.ravel() * area) @ (np.array(parts) - outliers) / (weight.ravel() @ area) + outliers
     likelihood.density = weight
     np.testing.assert_allclose(np.exp(likelihood.evaluate(state).log_p), expected, rtol=1e-8)
     likelihood.organ = np.full(60, -1, np.int8)

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from phytofit.likelihood import CloudLikelihood, State
+from phytofit.likelihood import N_STRIPS, CloudLikelihood, State
 from phytofit.models import LEAF, Organ, move
 from phytofit.parameters import ParameterSpace
 
-__all__ = ["Sighting", "across_leaf", "density_along", "flags_of", "sighting"]
+__all__ = ["Sighting", "across_leaf", "density_over", "flags_of", "sighting"]
 
 FloatArray = NDArray[np.float64]
 N_SECTIONS = 20  # of the leaf, of equal area
@@ -25,6 +25,8 @@ NEAR_TIP, FEW_BEYOND, N_BEYOND = 0.15, 12, 4000  # of the leaf's length; points;
 N_SECTORS = 12  # around the stem
 ROUND = 0.7  # share of them that must be seen
 BASE_SECTIONS = 2  # the leaf's first tenth
+END_SECTIONS = 3  # narrow: noise blurs them
+GAP, MANY_GAPS = 0.4, 0.04  # of the typical number of points; share of the blade
 FEW_ON_STEM = 60  # points
 LITTLE_EXPLAINED = 0.1  # share of outliers that is worth a remark
 MUCH_NOISE_CM = 1.0
@@ -44,12 +46,15 @@ class Sighting:
 
     ``sections`` (20,) density of points on sections of the leaf, base to tip, in units of the typical one;
     ``stem_points`` number of points on the stem; ``sectors`` share of the stem's circumference with points;
-    ``beyond`` number of points near the leaf's tip that are of no organ; if there are more than by chance, else 0.
+    ``gaps`` share of the blade (in sections and three strips each, without its ends) that clearly has no points where
+    other parts have; ``beyond`` number of points near the leaf's tip that are of no organ, 0 if there are not more than
+    by chance.
     """
 
     sections: FloatArray
     stem_points: float
     sectors: float
+    gaps: float
     beyond: float
 
     @property
@@ -66,6 +71,7 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
     points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]  # in the model's frame
     leaf = likelihood.model.organs(state.x)[1].row(0)
     place = _area_share(leaf, points)
+    gaps = _gaps(leaf, points[on_leaf > 0.5], place[on_leaf > 0.5])
     weight = np.where(on_leaf > 0.5, on_leaf, 0.0)
     found = np.bincount(np.minimum((place * N_SECTIONS).astype(int), N_SECTIONS - 1), weight, N_SECTIONS)
     typical = np.median(found[found > 0.0]) if np.any(found > 0.0) else 1.0
@@ -74,7 +80,27 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
     sector = np.bincount(((angle + np.pi) / (2 * np.pi) * N_SECTORS).astype(int) % N_SECTORS, minlength=N_SECTORS)
     shown = np.mean(sector > SEEN_DENSITY * np.quantile(sector, 0.75)) if len(stem_points) else 0.0
     beyond = _beyond_tip(likelihood, state, scores)
-    return Sighting(found / typical, float(on_stem.sum()), float(shown), float(beyond))
+    return Sighting(found / typical, float(on_stem.sum()), float(shown), gaps, float(beyond))
+
+
+def _gaps(leaf: Organ, points: FloatArray, place: FloatArray) -> float:
+    """Share of the blade that has few points where other parts have many; `place` (n,) of the area before each."""
+    section = np.minimum((place * N_SECTIONS).astype(int), N_SECTIONS - 1)
+    found = np.bincount(section * N_STRIPS + _strip(leaf, points), minlength=N_SECTIONS * N_STRIPS)
+    found = found.reshape(N_SECTIONS, N_STRIPS)[BASE_SECTIONS:-END_SECTIONS]
+    typical = float(np.quantile(found, TYPICAL))
+    low = (found < GAP * typical) & (typical - found > CLEARLY * np.sqrt(typical))
+    return float(low.mean())
+
+
+def _strip(leaf: Organ, points: FloatArray) -> NDArray[np.intp]:
+    """Strip (n,) of the blade that is nearest to each point, from its right edge."""
+    j, along = _place(leaf, points)
+    lateral = np.einsum("ni,ni->n", points - leaf.axis[j], leaf.frame[j][:, :, 1])
+    slope = (leaf.half_width[j + 1] - leaf.half_width[j]) / leaf.segment_lengths[j]
+    half = np.maximum(leaf.half_width[j] + slope * along, 1e-9)
+    strip: NDArray[np.intp] = np.clip((lateral / half + 1.0) * N_STRIPS / 2.0, 0, N_STRIPS - 1).astype(np.intp)
+    return strip
 
 
 def _beyond_tip(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> int:
@@ -94,11 +120,13 @@ def _beyond_tip(likelihood: CloudLikelihood, state: State, scores: FloatArray) -
     return len(there) if len(there) > expected + CLEARLY * np.sqrt(expected) else 0
 
 
-def density_along(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> FloatArray:
-    """Density (m,) of points on the pieces of the leaf, relative to where all was seen: 1 but in clear holes.
+def density_over(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> FloatArray:
+    """Density (m, 3) of points on the pieces of the leaf and their strips, relative to where all was seen: 1 but in
+    clear holes.
 
     A hole has leaf on both sides: what is missing at the tip is another matter, and near the stem it can't be told
-    whose the points are.
+    whose the points are.  It may leave a part of the leaf's breadth; a strip that lacks points all along is no hole,
+    but a width that is not right yet.
     """
     on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2]
     pose = likelihood.pose_of(state)
@@ -118,7 +146,16 @@ def density_along(likelihood: CloudLikelihood, state: State, scores: FloatArray)
     apart = np.hypot(middle[:, 0], middle[:, 1]) > stem.half_width.max() + OFF_STEM * max(state.noise[:2])
     before = np.arange(m) < (seen[-1] if len(seen) else 0)
     hole = apart & before & (ratio < HOLE) & (expected - found > CLEARLY * np.sqrt(expected))
-    return np.where(hole, np.maximum(ratio, LEAST_DENSITY), 1.0)
+    density = np.repeat(np.where(hole, np.maximum(ratio, LEAST_DENSITY), 1.0)[:, np.newaxis], N_STRIPS, axis=1)
+    taken = on_leaf > 0.5
+    cells = np.bincount(piece[taken] * N_STRIPS + _strip(leaf, points[taken]), minlength=m * N_STRIPS)
+    cells = np.apply_along_axis(np.convolve, 0, cells.reshape(m, N_STRIPS).astype(float), SMOOTHING, "same")
+    wanted = expected[:, np.newaxis] / N_STRIPS
+    part = cells / np.maximum(wanted, 1e-9)
+    wide = 0.5 * (leaf.half_width[1:] + leaf.half_width[:-1]) > EDGE_ON * state.noise[1]
+    lacking = (part < GAP) & (wanted - cells > CLEARLY * np.sqrt(wanted)) & (apart & before & wide)[:, np.newaxis]
+    lacking &= lacking.mean(axis=0) < 0.5
+    return np.where(lacking, np.minimum(density, np.maximum(part, LEAST_DENSITY)), density)
 
 
 def across_leaf(likelihood: CloudLikelihood, state: State) -> tuple[FloatArray, FloatArray]:
@@ -165,32 +202,38 @@ def flags_of(
 ) -> Iterator[str]:
     """The remarks on a fit: parameters x (k,), noise (2,) or more on stem and leaf, share of outliers, share of the
     midrib that was seen, and whether its tip clearly was; `scale` input lengths make a cm."""
-    value = dict(zip(space.names, x.tolist(), strict=True))
     if midrib_seen < 1.0:
         yield TIP_NOT_SEEN
     elif not tip_seen:
         yield TIP_DOUBTFUL
     if seen.beyond:
         yield BEYOND_TIP.format(seen.beyond)
-    if np.all(seen.sections[:BASE_SECTIONS] < SEEN_DENSITY):
-        yield "the leaf's base is hidden: its angle is read off the rest of the leaf"
-    if seen.leaf < 0.5:
-        yield f"only {100 * seen.leaf:.0f} % of the leaf was seen"
-    if seen.stem_points < FEW_ON_STEM:
-        yield f"only {seen.stem_points:.0f} points on the stem"
-    elif seen.sectors < ROUND:
-        yield f"the stem was seen from one side: its diameter rests on {360 * seen.sectors:.0f}° of its circumference"
+    yield from _of_what_was_seen(seen)
     if outlier_share >= LITTLE_EXPLAINED:
         yield f"the model does not explain {100 * outlier_share:.0f} % of the points"
     for name, std in zip(("stem", "leaf"), noise, strict=False):
         if std > MUCH_NOISE_CM:
             scatter = f"{std * scale:.3g} {_length_unit(scale)}"
             yield f"the points scatter by {scatter} around the {name}: far more than expected"
+    value = dict(zip(space.names, x.tolist(), strict=True))
     if 0.5 * value["stem_diameter"] < BLURRED * noise[0]:
         yield "the stem's points scatter by half its radius or more: its diameter is that of a tube, it may be filled"
     if 0.5 * value["leaf_width"] < EDGE_ON * noise[1]:
         yield "the leaf's width can't be told from the scatter of its points: was it seen edge-on?"
     yield from _against_the_prior(space, x, scale)
+
+
+def _of_what_was_seen(seen: Sighting) -> Iterator[str]:
+    if np.all(seen.sections[:BASE_SECTIONS] < SEEN_DENSITY):
+        yield "the leaf's base is hidden: its angle is read off the rest of the leaf"
+    if seen.leaf < 0.5:
+        yield f"only {100 * seen.leaf:.0f} % of the leaf was seen"
+    elif seen.gaps >= MANY_GAPS:
+        yield f"{100 * seen.gaps:.0f} % of the blade has next to no points: its width rests on the rest, and may be off"
+    if seen.stem_points < FEW_ON_STEM:
+        yield f"only {seen.stem_points:.0f} points on the stem"
+    elif seen.sectors < ROUND:
+        yield f"the stem was seen from one side: its diameter rests on {360 * seen.sectors:.0f}° of its circumference"
 
 
 def _against_the_prior(space: ParameterSpace, x: FloatArray, scale: float) -> Iterator[str]:

@@ -14,7 +14,7 @@ from phytofit.kernels.likelihood import LEAF_COLUMNS, STEM_COLUMNS, log_density
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
 
-__all__ = ["THICKNESS", "CloudLikelihood", "Evaluation", "State"]
+__all__ = ["N_STRIPS", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 
 FloatArray = NDArray[np.float64]
 N_EXTRA = 12  # entries of theta after the model's parameters, see State
@@ -27,6 +27,7 @@ STEP = 1e-4  # of a prior's spread, for the derivatives of the organs
 NOISE_CM, NOISE_FACTOR = 0.3, 3.0  # of a surface's points: the prior's middle, and one spread of it
 SHARE_SPREAD = 2.5  # of the logits of the shares
 STEM_SHARE, OUTLIER_SHARE = 0.3, 0.03  # before a cloud is seen; the rest is the leaf's
+N_STRIPS = 3  # of a leaf, along it, that may be seen or not, see log_density
 MOST_OUTLIERS = np.log(4.0)  # bound of logit_outlier
 
 
@@ -108,7 +109,8 @@ class CloudLikelihood:
     weights : (n,) of the points; None: all 1
     thick : whether the leaf may have a thickness, which widens the noise across the blade
     cut : whether the leaf's tip may be missing
-    density : (n_pieces,) of points on the pieces of the leaf, relative to where all was seen; None: 1 everywhere
+    density : (n_pieces, 3) of points on the pieces of the leaf, three strips each, relative to where all was seen;
+        None: 1 everywhere
     """
 
     def __init__(
@@ -129,7 +131,7 @@ class CloudLikelihood:
         self.points = np.ascontiguousarray(points)
         self.organ = np.full(len(points), -1, np.int8) if organ is None else organ
         self.weights = weights
-        self.density = np.ones(model.n_pieces) if density is None else density
+        self.density = np.ones((model.n_pieces, N_STRIPS)) if density is None else density
         self.outlier_density = 1.0 / _volume(self.points)
         self._executor = executor
         inside = 1.0 - STEM_SHARE - OUTLIER_SHARE
@@ -201,7 +203,7 @@ class CloudLikelihood:
             stem_change[:, : k + 1, :-1] = _change(stem, stem_length, stem.half_width, steps)[..., :-2]
             stem_change[:, : k + 1, -1] = _slope(radius, steps).T
             area_change[: k + 1] = _slope(
-                np.log(np.sum(self.density * length * (half[:, 1:] + half[:, :-1]), 1)), steps
+                np.log(np.sum(self.density.mean(1) * length * (half[:, 1:] + half[:, :-1]), 1)), steps
             )
             stem_area_change[: k + 1] = _slope(np.log(np.sum(stem_length * radius, 1)), steps)
             centre_in_model = r.T @ (state.center + state.shift - pose[:3, 3])

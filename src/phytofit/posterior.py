@@ -15,7 +15,7 @@ from scipy.special import stdtrit
 
 from phytofit.dependence import Dependence, score_dependence
 from phytofit.distances import Reference, quantile_hausdorff
-from phytofit.flags import Sighting, across_leaf, density_along, sighting
+from phytofit.flags import Sighting, across_leaf, density_over, sighting
 from phytofit.likelihood import THICKNESS, CloudLikelihood, Evaluation, State
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
@@ -301,7 +301,7 @@ def _end(species: Species, state: State, cloud: _Cloud, *, thick: bool = False, 
         state = likelihood.extended(state)
         end = _refined(likelihood, state)
         state = State(end.theta, state.pose, state.center)
-        density = density_along(likelihood, state, likelihood.evaluate(state).scores)
+        density = density_over(likelihood, state, likelihood.evaluate(state).scores)
         if np.allclose(density, likelihood.density, atol=0.05):
             break
     return _End(likelihood, state, end.converged)

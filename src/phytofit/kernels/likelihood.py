@@ -11,6 +11,7 @@ __all__ = ["LEAF_COLUMNS", "STEM_COLUMNS", "log_density"]
 REACH = 5.5  # noise levels from a surface at which its density counts as none: e^-15 of the greatest
 LEAF_COLUMNS = 9  # of a leaf segment's change: translation (3), rotation (3), length, half widths at both ends
 STEM_COLUMNS = 8  # of a stem segment's: translation (3), rotation (3), length, radius
+EDGES = np.array([-1.0, -1.0 / 3.0, 1.0 / 3.0, 1.0])  # of the strips of a leaf's segment, in half widths
 ROOT_TWO = np.sqrt(2.0)
 ROOT_TWO_PI = np.sqrt(2.0 * np.pi)
 
@@ -70,6 +71,16 @@ def _between(low, high, std):
 
 
 @kernel
+def _step(density, e):
+    """By how much the density rises at an edge of the strips, from right to left; beyond the outer ones it is 0."""
+    if e == 0:
+        return density[0]
+    if e == 3:
+        return -density[2]
+    return density[e] - density[e - 1]
+
+
+@kernel
 def log_density(
     points, organ,
     leaf_origin, leaf_frame, leaf_length, leaf_half, leaf_density, leaf_change, leaf_area_change,
@@ -89,7 +100,8 @@ def log_density(
     organ : (n,) int8: 0 stem, 1 leaf; -1 unknown, may be of either
     leaf_origin (m, 3), leaf_frame (m, 3, 3) columns tangent, lateral, normal, leaf_length (m,), leaf_half (m + 1,) :
         the leaf's segments, and half widths at the nodes
-    leaf_density (m,) : of points on each segment, relative to where all was seen
+    leaf_density (m, 3) : of points on three strips along each segment, from its right edge (negative lateral) to its
+        left, relative to where all was seen
     stem_origin (s, 3), stem_frame (s, 3, 3) columns tangent and two across, stem_length (s,), stem_radius (s,) : the
         stem's segments
     leaf_change (m, k, 9), leaf_area_change (k,), stem_change (s, k, 8), stem_area_change (k,) : change of a segment,
@@ -112,7 +124,8 @@ def log_density(
     depth = REACH * thickness
     area = 0.0
     for j in range(m):
-        area += leaf_density[j] * leaf_length[j] * (leaf_half[j] + leaf_half[j + 1])
+        mean = (leaf_density[j, 0] + leaf_density[j, 1] + leaf_density[j, 2]) / 3.0
+        area += mean * leaf_length[j] * (leaf_half[j] + leaf_half[j + 1])
     stem_area = 0.0
     for j in range(len(stem_length)):
         stem_area += stem_length[j] * stem_radius[j]
@@ -201,17 +214,26 @@ def log_density(
                 pull = (at_start - at_end) / along
                 s = min(max((u + square * pull) / length, 0.0), 1.0)
                 half = leaf_half[j] + s * slope
-                across = _between(v - half, v + half, leaf_noise)
-                density = weight * leaf_density[j] * _normal(w, thickness) * along * across
+                across = 0.0
+                for e in range(4):
+                    step = _step(leaf_density[j], e)
+                    if step != 0.0:
+                        across -= step * 0.5 * erf((half * EDGES[e] - v) / (ROOT_TWO * leaf_noise))
+                density = weight * _normal(w, thickness) * along * across
                 if density <= 0.0:
                     continue
                 on_leaf += density
                 if wanted:
-                    at_left, at_right = _normal(v + half, leaf_noise), _normal(v - half, leaf_noise)
-                    by_u = pull
-                    by_v = (at_left - at_right) / across
+                    by_u, by_v, by_half, sideways = pull, 0.0, 0.0, 0.0
+                    for e in range(4):
+                        step = _step(leaf_density[j], e)
+                        if step != 0.0:
+                            edge = half * EDGES[e] - v
+                            at_edge = step * _normal(edge, leaf_noise) / across
+                            by_v += at_edge
+                            by_half -= EDGES[e] * at_edge
+                            sideways += edge * at_edge
                     by_w = -w / (thickness * thickness)
-                    by_half = (at_left + at_right) / across
                     by_length = at_end / along
                     spread = (u * at_start - (u - length) * at_end) / along
                     by_place = by_half * slope / length  # of the place where the half width is taken
@@ -223,7 +245,7 @@ def log_density(
                         - spread
                         + by_place
                         * (square * pull * (1.0 + spread) + (u * u * at_start - (u - length) ** 2 * at_end) / along)
-                        - ((v + half) * at_left - (v - half) * at_right) / across
+                        + sideways
                     )
                     for c in range(k):
                         change = leaf_change[j, c]
