@@ -38,8 +38,10 @@ class Dependence:
     correlation: float
 
 
-def score_dependence(likelihood: CloudLikelihood, state: State) -> Dependence:
+def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependence | None = None) -> Dependence:
     """Covariance of the sum of scores of points whose errors are correlated with their neighbours'.
+
+    How far they are correlated is taken from what is `known` of another model of the same cloud, if it is given.
 
     A spatial sandwich (Conley, J. Econometrics 92, 1999), but with a correlation that is first fitted to the points'
     distances from the surface: a bell over distance, a exp(-d² / (2 reach²)).  A score depends on a point's place on
@@ -61,7 +63,9 @@ def score_dependence(likelihood: CloudLikelihood, state: State) -> Dependence:
         errors[organ] -= errors[organ].mean() if organ.any() else 0.0  # noise moves points off a tube on average
     # places on the surface: points that are near each other in space have been moved alike, by selection
     place = likelihood.points - distance[:, np.newaxis] * frame[:, :, 2]
-    correlation, reach = _correlation(place[sure], errors[sure])
+    correlation, reach = (
+        _correlation(place[sure], errors[sure]) if known is None else (known.correlation, known.reach_cm)
+    )
     if correlation == 0.0:
         return Dependence(independent, 1.0, float(len(scores)), 0.0, 0.0)
 

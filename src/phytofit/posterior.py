@@ -281,7 +281,7 @@ def _choice(found: Sequence[_End]) -> _Chosen:
     backed = [e if i % 2 == 0 or gains[i] > TIP_MISSING else -np.inf for i, e in enumerate(evidence)]
     best = int(np.argmax(backed))
     if best < len(found) - 1:
-        dependence = score_dependence(found[best].likelihood, found[best].state)
+        dependence = score_dependence(found[best].likelihood, found[best].state, dependence)
     return _Chosen(found[best], evidence[best], dependence, best % 2 == 0 and gains[best] > TIP_DOUBTFUL)
 
 
