@@ -230,8 +230,9 @@ def sweeps(pool: ProcessPoolExecutor, phytomers: int, with_peers: bool) -> None:
 
 def draw(ax, name: str, sweep: Sweep, shown: np.ndarray) -> list:  # type: ignore[no-untyped-def,type-arg]
     x = np.arange(len(sweep.steps))
-    ax.plot(x, shown[:, 3], color="0.45", marker="v", lw=1.0, label="the same by the paper's method")
-    ax.plot(x, shown[:, 4], color="0.7", marker="x", lw=1.0, label="the same without a model (model_free.py)")
+    if np.isfinite(shown[:, 3:]).any():
+        ax.plot(x, shown[:, 3], color="0.45", marker="v", lw=1.0, label="the same by the paper's method")
+        ax.plot(x, shown[:, 4], color="0.7", marker="x", lw=1.0, label="the same without a model (model_free.py)")
     ax.plot(x, shown[:, 0], color="#0072B2", marker="o", label="leaf length: median absolute error, cm")
     ax.set_xticks(x, [f"{step:g}" for step in sweep.steps])
     ax.set_xlabel(f"{name} ({sweep.unit})")

@@ -26,7 +26,7 @@ N_SECTORS = 12  # around the stem
 ROUND = 0.7  # share of them that must be seen
 BASE_SECTIONS = 2  # the leaf's first tenth
 END_SECTIONS = 3  # narrow: noise blurs them
-GAP, MANY_GAPS = 0.4, 0.04  # of the typical number of points; share of the blade
+GAP, EMPTY, MANY_GAPS = 0.4, 0.1, 0.04  # of the typical number of points, twice; share of the blade
 FEW_ON_STEM = 60  # points
 LITTLE_EXPLAINED = 0.1  # share of outliers that is worth a remark
 MUCH_NOISE_CM = 1.0
@@ -89,8 +89,24 @@ def _gaps(leaf: Organ, points: FloatArray, place: FloatArray) -> float:
     found = np.bincount(section * N_STRIPS + _strip(leaf, points), minlength=N_SECTIONS * N_STRIPS)
     found = found.reshape(N_SECTIONS, N_STRIPS)[BASE_SECTIONS:-END_SECTIONS]
     typical = float(np.quantile(found, TYPICAL))
-    low = (found < GAP * typical) & (typical - found > CLEARLY * np.sqrt(typical))
-    return float(low.mean())
+    return float(_clearly_lacking(found.astype(float), np.full(found.shape, typical)).mean())
+
+
+def _clearly_lacking(found: FloatArray, wanted: FloatArray) -> NDArray[np.bool_]:
+    """Where next to none are found of the points that are wanted, or so few that neither chance nor the unevenness of
+    the rest explains it."""
+    share = found / np.maximum(wanted, 1e-9)
+    spread = np.maximum(np.sqrt(wanted), _upper_spread(share) * wanted)
+    few = (share < GAP) & (wanted - found > CLEARLY * spread)
+    none = (share < EMPTY) & (wanted > CLEARLY**2)
+    lacking: NDArray[np.bool_] = few | none
+    return lacking
+
+
+def _upper_spread(values: FloatArray) -> float:
+    """Standard deviation of normal values, from those above the typical one: holes are below it."""
+    typical, high = np.quantile(values, [TYPICAL, 0.95])
+    return float((high - typical) / 0.9704)  # of the normal quantiles' difference
 
 
 def _strip(leaf: Organ, points: FloatArray) -> NDArray[np.intp]:
@@ -153,7 +169,10 @@ def density_over(likelihood: CloudLikelihood, state: State, scores: FloatArray) 
     wanted = expected[:, np.newaxis] / N_STRIPS
     part = cells / np.maximum(wanted, 1e-9)
     wide = 0.5 * (leaf.half_width[1:] + leaf.half_width[:-1]) > EDGE_ON * state.noise[1]
-    lacking = (part < GAP) & (wanted - cells > CLEARLY * np.sqrt(wanted)) & (apart & before & wide)[:, np.newaxis]
+    looked_at = apart & before & wide
+    lacking = np.zeros(cells.shape, bool)
+    if looked_at.any():
+        lacking[looked_at] = _clearly_lacking(cells[looked_at], np.repeat(wanted[looked_at], N_STRIPS, axis=1))
     lacking &= lacking.mean(axis=0) < 0.5
     return np.where(lacking, np.minimum(density, np.maximum(part, LEAST_DENSITY)), density)
 
