@@ -16,8 +16,9 @@ from phytofit.species import Species
 __all__ = ["Prepared", "prepare"]
 
 FloatArray = NDArray[np.float64]
-STEM_MARGIN, STEM_MARGIN_CM = 1.3, 0.5  # of its radius, and more, around a stem within which points are the stem's
+STEM_MARGIN, STEM_MARGIN_CM = 1.3, 1.0  # of its radius, and more, around a stem within which points are the stem's
 LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
+LEAST_PIECE = 30  # points; fewer are no piece of anything, and are left to be told for outliers
 NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
 
@@ -89,7 +90,7 @@ def prepare(
 
 
 def _meant(points: FloatArray, start: StartPose, seed_points: FloatArray) -> NDArray[np.bool_]:
-    """Which points (n, 3) are of the stem, or of what is connected with the seed points (k, 3) beside it, cm."""
+    """Which points (n, 3), cm, are not of pieces beside the stem that the seed points (k, 3) are not connected with."""
     upright = (points - start.pose[:3, 3]) @ start.pose[:3, :3]
     margin = STEM_MARGIN * start.radius + STEM_MARGIN_CM
     on_stem = np.hypot(upright[:, 0], upright[:, 1]) < margin
@@ -106,7 +107,8 @@ def _meant(points: FloatArray, start: StartPose, seed_points: FloatArray) -> NDA
     links = tree.query_pairs(max(LINK * typical, LEAST_LINK_CM), output_type="ndarray")
     graph = coo_array((np.ones(len(links), bool), links.T), shape=(len(beside), len(beside)))
     piece = connected_components(graph, directed=False)[1]
-    on_stem[beside[np.isin(piece, piece[nearest])]] = True
+    small = np.bincount(piece)[piece] < LEAST_PIECE
+    on_stem[beside[small | np.isin(piece, piece[nearest])]] = True
     return on_stem
 
 
