@@ -244,9 +244,11 @@ def test_real_phytomers_are_measured_near_the_hand(name):
 def test_every_cloud_of_the_paper_in_three_orientations(path):
     cloud = phytofit.read_cloud(path, "mm" if "0015" in path.stem else "cm")
     given = phytofit.fit(cloud, method="paper")
+    others = [phytofit.fit(cloud, method="paper", seed=seed) for seed in range(1, 4)]
+    spread = max(angle_deg(other.pose[:3, 2], given.pose[:3, 2]) for other in others)  # the method's own
     for seed in range(3):
         turn = phytofit.simulation.random_pose(np.random.default_rng(seed))
         turned = dataclasses.replace(cloud, points=cloud.points @ turn[:3, :3].T + turn[:3, 3])
         moved = phytofit.fit(turned, method="paper")
         assert values(moved)["leaf_length"] == pytest.approx(values(given)["leaf_length"], abs=2.0)
-        assert angle_deg(moved.pose[:3, 2], turn[:3, :3] @ given.pose[:3, 2]) < 3.0
+        assert angle_deg(moved.pose[:3, 2], turn[:3, :3] @ given.pose[:3, 2]) < max(1.0, 2.0 * spread)
