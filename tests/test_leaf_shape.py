@@ -14,13 +14,15 @@ ROTATION = 1e-9  # frames are products of three rotations
 QUARTER = 0.03  # of the greatest: the wave's extreme lies at 0.21 of the midrib, not at 0.25
 
 NAMES = Phytomer.PARAMETERS
-X = np.array([3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0])
+X = np.array([3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0, 0.0])
 LOW = np.array(
-    [0.5, 2.0, 5.0, 10.0, 1.0, -6.0, 0.1, 0.0, -40.0, -20.0, -80.0, -60.0, -90.0, -270.0, 0.1, 0.05, 0.3, 0.5]
+    [0.5, 2.0, 5.0, 10.0, 1.0, -6.0, 0.1, 0.0, -40.0, -20.0, -80.0, -60.0, -90.0, -270.0, 0.1, 0.05, 0.3, 0.5, -30.0]
 )
-HIGH = np.array([5.0, 25.0, 150.0, 80.0, 9.0, 6.0, 20.0, 1.5, 40.0, 20.0, 80.0, 60.0, 90.0, 270.0, 1.3, 0.9, 6.0, 1.5])
+HIGH = np.array(
+    [5.0, 25.0, 150.0, 80.0, 9.0, 6.0, 20.0, 1.5, 40.0, 20.0, 80.0, 60.0, 90.0, 270.0, 1.3, 0.9, 6.0, 1.5, 40.0]
+)
 
-SHAPES = arrays(np.float64, (18,), elements=st.floats(0, 1), fill=st.nothing()).map(lambda u: LOW + u * (HIGH - LOW))
+SHAPES = arrays(np.float64, (19,), elements=st.floats(0, 1), fill=st.nothing()).map(lambda u: LOW + u * (HIGH - LOW))
 
 
 def grow(x, **constants):
@@ -66,13 +68,13 @@ def assert_same(organs, others, atol):
 
 def test_neutral_values_are_those_of_the_constants():
     neutral = Phytomer(widest_share=0.3, concavity=1.5).neutral
-    assert neutral.shape == (len(NAMES),) == (18,)
-    assert len(Phytomer.UNITS) == 18
+    assert neutral.shape == (len(NAMES),) == (19,)
+    assert len(Phytomer.UNITS) == 19
     assert np.all(np.isnan(neutral[:6]))  # the paper's have none
-    np.testing.assert_array_equal(neutral[6:], [0.0] * 8 + [1.0, 0.3, 1.5, 1.0])
+    np.testing.assert_array_equal(neutral[6:], [0.0] * 8 + [1.0, 0.3, 1.5, 1.0, 0.0])
 
 
-@given(SHAPES, st.integers(6, 18), st.sampled_from([0.3, 0.5, 0.62]), st.floats(1.0, 3.0))
+@given(SHAPES, st.integers(6, 19), st.sampled_from([0.3, 0.5, 0.62]), st.floats(1.0, 3.0))
 def test_neutral_values_give_the_papers_organs(x, given_parameters, widest, concavity):
     """However many of them are left out."""
     constants = {"widest_share": widest, "concavity": concavity}
@@ -114,7 +116,7 @@ def test_widths_are_those_of_a_leaf(x):
     np.testing.assert_allclose(leaf.half_width[0], half * base, rtol=1e-9)
 
 
-@given(arrays(np.float64, (4, 18), elements=st.floats(0, 1)).map(lambda u: LOW + u * (HIGH - LOW)))
+@given(arrays(np.float64, (4, 19), elements=st.floats(0, 1)).map(lambda u: LOW + u * (HIGH - LOW)))
 def test_a_population_is_its_plants_one_by_one(xs):
     stem, leaf = Phytomer().organs(xs)
     for i, x in enumerate(xs):
@@ -140,7 +142,7 @@ def test_upside_down_is_the_same_plant(x):
     np.testing.assert_allclose(pose @ pose_back, np.eye(4), atol=1e-9)
 
 
-@pytest.mark.parametrize("k", range(7, 19))
+@pytest.mark.parametrize("k", range(7, 20))
 def test_upside_down_with_any_number_of_parameters(k):
     """As with all of them, and the others neutral."""
     x = X.copy()
@@ -198,6 +200,16 @@ def test_wave_points_a_quarter_lower_and_three_quarters_higher():
     np.testing.assert_allclose(lower[[25, 75]], [10.0, -10.0], rtol=QUARTER)
     np.testing.assert_allclose(lower, -lower[::-1], atol=ANGLE)
     assert np.abs(lower).max() == pytest.approx(10.0, rel=1e-3)
+
+
+@pytest.mark.parametrize("degrees", [-20.0, 30.0])
+def test_base_bend_turns_the_midrib_down_close_to_its_start(degrees):
+    """The first segment keeps its angle; two thirds of the bend are done after a twentieth of the leaf, and all of it
+    is there over most of it."""
+    lower = heading(grow([*X[:18], degrees], n_pieces=101)[1])[0] - heading(grow(X, n_pieces=101)[1])[0]
+    assert lower[0] == pytest.approx(0.0, abs=ANGLE)
+    assert lower[5] == pytest.approx(degrees * (1.0 - np.exp(-1.0)), rel=1e-9)
+    np.testing.assert_allclose(lower[30:], degrees, rtol=3e-3)
 
 
 @pytest.mark.parametrize("degrees", [-70.0, 25.0])

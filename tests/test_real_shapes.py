@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import phytofit
-from phytofit.posterior import _Cloud, _end, _lower_insertion, _turned_blade
+from phytofit.beginnings import along_points, lower_insertion, turned_blade
+from phytofit.posterior import _Cloud, _end
 
 GENTLE = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 15.0}
 REAL = {"leaf_base_width": 0.5, "leaf_widest_at": 0.4, "leaf_bow": 10.0}
@@ -45,7 +46,8 @@ def test_the_start_with_a_turned_blade_is_turned_as_the_points_lie():
     plain = SPECIES.leading(7)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
     start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(made.x[:7], np.eye(4), 1.0)
-    (turned,) = _turned_blade(SPECIES, _end(plain, start, _Cloud(points, None, None)))
+    end = _end(plain, start, _Cloud(points, None, None))
+    (turned,) = turned_blade(SPECIES, end.likelihood, end.state)
     assert turned.x[NAMES.index("leaf_roll")] == pytest.approx(60.0, abs=15.0)
     assert turned.x[NAMES.index("leaf_twist")] == pytest.approx(30.0, abs=25.0)
 
@@ -55,7 +57,8 @@ def test_a_level_blade_is_not_begun_turned():
     plain = SPECIES.leading(7)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
     start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(made.x[:7], np.eye(4), 1.0)
-    assert _turned_blade(SPECIES, _end(plain, start, _Cloud(points, None, None))) == []
+    end = _end(plain, start, _Cloud(points, None, None))
+    assert list(turned_blade(SPECIES, end.likelihood, end.state)) == []
 
 
 def test_a_sheath_that_ends_at_the_collar():
@@ -71,7 +74,7 @@ def test_a_sheath_that_ends_at_the_collar():
 def test_the_start_with_a_lower_insertion_moves_only_the_leafs_base():
     made = grown()
     likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
-    (lower,) = _lower_insertion(SPECIES, likelihood.start(made.x, np.eye(4), 0.3))
+    (lower,) = lower_insertion(SPECIES, likelihood.start(made.x, np.eye(4), 0.3))
     assert lower.x[1] == pytest.approx(made.x[1] - 0.12 * made.x[3])
     assert lower.x[1] + lower.x[6] == pytest.approx(made.x[1] + made.x[6])
     before, after = (SPECIES.model.organs(x)[1].axis[0] for x in (made.x, lower.x))
@@ -84,6 +87,36 @@ def test_a_leaf_that_hugs_the_stem_is_followed_down_to_its_insertion():
     made = grown(leaf_angle=3.0, leaf_rotate_angle=4.5, collar_offset=1.0, leaf_bow=-8.0, leaf_base_width=0.9)
     result = fitted(made)
     assert trait(result, "leaf_length").value == pytest.approx(55.0, abs=2.5)
+
+
+def test_a_leaf_that_bends_down_at_its_collar():
+    """Steep at the stem, and 25 degrees lower a few centimetres on."""
+    made = grown(leaf_angle=20.0, leaf_base_bend=25.0, collar_offset=1.0)
+    assert_held(made, fitted(made), "leaf_length", "leaf_angle", "leaf_width")
+
+
+def test_a_leaf_that_curls_back_is_begun_along_its_points():
+    """From a state whose leaf stops where the real one turns away, the midrib is laid along the rest of it."""
+    made = grown(leaf_length=70.0, leaf_rotate_angle=5.5, leaf_bow=0.0, n_points=4000)
+    points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    x = made.x.copy()
+    x[[3, 5]] = 45.0, 1.0
+    state = likelihood.start(x, np.eye(4), 0.5)
+    (along,) = along_points(SPECIES, likelihood, state)
+    assert along.x[3] == pytest.approx(70.0, abs=4.0)
+    there, true = (SPECIES.model.organs(it)[1].axis[0] for it in (along.x, made.x))
+    assert np.linalg.norm(there[5:] - true[5:], axis=1).max() < 4.0
+    assert np.linalg.norm(SPECIES.model.organs(x)[1].axis[0, -1] - true[-1]) > 20.0
+    assert list(along_points(SPECIES, likelihood, likelihood.start(made.x, np.eye(4), 0.5))) == []
+
+
+def test_a_leaf_in_pieces_has_no_line():
+    made = grown(leaf_length=70.0)
+    points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    scarce = np.concatenate([points[made.labels == 1], points[made.labels == 2][:15]])
+    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, scarce)
+    assert list(along_points(SPECIES, likelihood, likelihood.start(made.x, np.eye(4), 0.5))) == []
 
 
 def test_points_beyond_the_tip_are_flagged_and_open_the_length():
@@ -122,7 +155,7 @@ def test_a_stem_no_thicker_than_its_scatter_is_flagged():
     assert any("scatter by half its radius" in flag for flag in fitted(made).flags)
 
 
-@pytest.mark.parametrize("k", range(8, 19))
+@pytest.mark.parametrize("k", range(8, 20))
 def test_a_species_with_any_number_of_parameters(k):
     made = grown(leaf_angle=10.0, collar_offset=1.0, n_points=1200)
     result = phytofit.fit(made.points, "cm", species=SPECIES.leading(k), up=made.pose[:3, 2], threads=2)

@@ -15,9 +15,10 @@ from rich.table import Table
 from phytofit.cloud import PointCloud
 from phytofit.distances import DISTANCES
 from phytofit.errors import PhytofitError, SettingError
-from phytofit.fitting import AXES, METHODS, Fit, fit, parse_up
+from phytofit.fitting import METHODS, Fit, fit
 from phytofit.formats import read_cloud, write_cloud
 from phytofit.optimize import Generation
+from phytofit.preparation import AXES, parse_up
 from phytofit.recipe import defaults, recipe
 from phytofit.results import prepare_folder, result_names, save_fit, table_text, trait_table, write_text
 from phytofit.simulation import SimulatedPhytomer, simulate

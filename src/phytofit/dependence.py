@@ -8,10 +8,11 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
+from phytofit.flags import across_leaf
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import Organ, move
 
-__all__ = ["Dependence", "score_dependence"]
+__all__ = ["Dependence", "score_dependence", "width_misfit"]
 
 FloatArray = NDArray[np.float64]
 SHIFT = 0.3  # of the noise: by so much points are moved to see how their scores change
@@ -22,6 +23,7 @@ LONGEST_CM = 10.0
 REACHES_CM = np.geomspace(0.2, 6.0, 30)
 CLEAR = 4.0  # standard errors by which a correlation must differ from none
 CELL = 0.5  # of the reach: points within such a cell count as one place
+N_PIECES, LEAST_ON_PIECE = 15, 40  # of the leaf, whose width is compared with the model's; points
 CUT = 2.5  # reaches at which the correlation counts as none
 
 
@@ -95,6 +97,32 @@ def _change_of_scores(likelihood: CloudLikelihood, state: State, direction: Floa
     shift = (SHIFT * std)[:, np.newaxis] * direction
     there, back = (likelihood.at(likelihood.points + sign * shift).evaluate(state).scores for sign in (1.0, -1.0))
     return (there - back) / (2.0 * SHIFT)
+
+
+def width_misfit(likelihood: CloudLikelihood, state: State) -> float:
+    """Standard deviation of the leaf's width about the model's, place by place, as a share of it, beyond chance.
+
+    Points that are uniform across a strip vary by a third of its half width squared, and by the noise.
+    """
+    scores = likelihood.evaluate(state).scores
+    on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2] > 0.5
+    leaf = likelihood.model.organs(state.x)[1].row(0)
+    lengths = leaf.segment_lengths
+    place, across = across_leaf(likelihood, state)
+    place, lateral = place[on_leaf], across[on_leaf, 0]
+    half = np.interp(place * lengths.sum(), np.concatenate([[0.0], np.cumsum(lengths)]), leaf.half_width)
+    ratio, chance = [], []
+    for i in range(1, N_PIECES - 2):  # not where stem and tip are
+        those = (place * N_PIECES).astype(int) == i
+        n = np.count_nonzero(those)
+        if n < LEAST_ON_PIECE:
+            continue
+        wide = np.mean(half[those] ** 2) / 3.0
+        ratio.append(np.sqrt(max(0.0, np.mean(lateral[those] ** 2) - state.noise[1] ** 2) / wide))
+        chance.append(0.2 / n * (1.0 + state.noise[1] ** 2 / wide) ** 2)
+    if len(ratio) < 3:
+        return 0.0
+    return float(np.sqrt(max(0.0, np.var(ratio, ddof=1) - np.mean(chance))))
 
 
 def _local(organs: tuple[Organ, ...], points: FloatArray, on_stem: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:

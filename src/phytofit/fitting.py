@@ -15,20 +15,20 @@ from phytofit.cloud import PointCloud, from_points
 from phytofit.distances import DISTANCES, Reference
 from phytofit.errors import NoPhytomerError, SettingError, Status
 from phytofit.flags import flags_of
-from phytofit.models import Organ, move
+from phytofit.intervals import Ends, propagated
+from phytofit.models import STEM, Organ, move
 from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parameters import ParameterSpace
 from phytofit.pose import StartPose
 from phytofit.posterior import DITHER_CM, Estimate, estimate
-from phytofit.preparation import Prepared, prepare
+from phytofit.preparation import Prepared, parse_points, parse_up, prepare
 from phytofit.species import Species, load_species
 from phytofit.traits import CHORD_CM, Trait, measure
 
-__all__ = ["METHODS", "Fit", "fit", "mean_at", "parse_up"]
+__all__ = ["METHODS", "Fit", "fit", "mean_at"]
 
 FloatArray = NDArray[np.float64]
-AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 N_PAPER = 6  # parameters of Eq. (1)
 N_SEARCHED = 7  # those and the stem above the leaf
 SEARCH = ("n_samples", "n_generations", "elite_fraction", "covariance_noise")
@@ -111,17 +111,17 @@ class Fit:
         """
         traits = self._measured(self.x)
         if self.estimate is not None:
-            std = self._trait_std(np.array([trait.value for trait in traits]))
+            ends = self._ends()
             open_above = () if self.estimate.tip_seen else OPEN_WITHOUT_TIP
             traits = [
                 replace(
                     trait,
-                    low=max(0.0, trait.value - self._not_seen(trait.name) - self.estimate.quantile * s),
-                    high=None if trait.name in open_above else trait.value + self.estimate.quantile * s,
+                    low=max(0.0, trait.value - self._not_seen(trait.name) - below),
+                    high=None if trait.name in open_above else trait.value + above,
                 )
-                if np.isfinite(s)
+                if np.isfinite(below + above)
                 else trait
-                for trait, s in zip(traits, std.tolist(), strict=True)
+                for trait, below, above in zip(traits, ends.below.tolist(), ends.above.tolist(), strict=True)
             ]
         if not self.relative:
             return traits
@@ -129,8 +129,11 @@ class Fit:
 
     def _measured(self, x: FloatArray) -> list[Trait]:
         method = self.method if self.estimate is None else f"{self.method}, 95 % {INTERVAL_METHOD}"
-        chord = np.inf if self.relative else CHORD_CM
-        return measure(self._organs_of(x), chord_cm=chord, method=method, flags=self.flags)
+        return measure(self._organs_of(x), chord_cm=self._chord_cm, method=method, flags=self.flags)
+
+    @property
+    def _chord_cm(self) -> float:
+        return np.inf if self.relative else CHORD_CM
 
     def _not_seen(self, name: str) -> float:
         """What of a trait belongs to a tip that was not seen: the interval's low end is without it."""
@@ -146,21 +149,28 @@ class Fit:
         )
         return float(pieces.sum() - until)
 
-    def _trait_std(self, values: FloatArray) -> FloatArray:
-        """Standard errors of the traits by the delta method, slopes taken over one standard error of each parameter."""
-        steps = 0.5 * np.sqrt(np.diag(self.covariance))
-        space = self.species.space
-        slopes = np.zeros((len(values), len(steps)))
-        for i in np.flatnonzero(steps):
-            at, ends = [], []
-            for sign in (1.0, -1.0):
-                x = self.x.copy()
-                x[i] = np.clip(x[i] + sign * steps[i], space.lower[i], space.upper[i])
-                at.append(x[i])
-                ends.append(np.array([trait.value for trait in self._measured(x)]))
-            slopes[:, i] = (ends[0] - ends[1]) / (at[0] - at[1])
-        std: FloatArray = np.sqrt(np.einsum("ti,ij,tj->t", slopes, self.covariance, slopes))
-        return std
+    def _ends(self) -> Ends:
+        """How far the traits' intervals reach: by the errors of the parameters, by how far the blade's surface lies
+        off the model's where it leaves the stem, and by how far its width does."""
+        assert self.estimate is not None
+        space, made = self.species.space, self.estimate
+        angle = np.array(space.units) == "deg"
+        lower, upper = np.where(angle, -np.inf, space.lower), np.where(angle, np.inf, space.upper)
+        ends = propagated(self._values, self.x, self.covariance, made.quantile, lower, upper)
+        off = made.quantile * made.misfit_cm * self.scale
+        value = self._values(self.x)
+        changes = np.array([self._values(self.x, thicker=by) - value for by in (off, -off)])
+        changes[:, [trait.organ == STEM for trait in self._measured(self.x)]] = 0.0
+        ends = ends.with_error(np.minimum(changes, 0.0).min(axis=0), np.maximum(changes, 0.0).max(axis=0))
+        wider = [trait.name == "leaf_width" for trait in self._measured(self.x)]
+        by_width = np.where(wider, made.quantile * made.width_misfit * value, 0.0)
+        return ends.with_error(by_width, by_width)
+
+    def _values(self, x: FloatArray, thicker: float = 0.0) -> FloatArray:
+        """Values (t,) of the traits, of a stem with a radius that is so much larger."""
+        stem, leaf = self._organs_of(x)
+        stem = replace(stem, half_width=np.maximum(stem.half_width + thicker, 0.0))
+        return np.array([trait.value for trait in measure((stem, leaf), chord_cm=self._chord_cm)])
 
     @property
     def elite_std(self) -> dict[str, float]:
@@ -169,32 +179,6 @@ class Fit:
         units = self.species.space.units[: len(last)]
         scaled = [s * self.scale if unit == "cm" else s for s, unit in zip(last.tolist(), units, strict=True)]
         return dict(zip(self.species.space.names, scaled, strict=False))
-
-
-def parse_up(up: str | ArrayLike | None) -> FloatArray | None:
-    """A unit vector (3,) from ``"x" .. "-z"`` or three numbers; None stays None."""
-    if up is None:
-        return None
-    if isinstance(up, str):
-        if up not in AXES:
-            raise SettingError(f"up: expected one of {', '.join(AXES)}, got {up!r}")
-        return np.array(AXES[up], float)
-    vector = np.asarray(up, float)
-    if vector.shape != (3,) or not np.isfinite(vector).all() or not np.any(vector):
-        raise SettingError(f"up: expected three numbers that are not all zero, got {up!r}")
-    unit: FloatArray = vector / np.linalg.norm(vector)
-    return unit
-
-
-def _parse_points(points: ArrayLike) -> FloatArray:
-    """(k, 3) of one or more points."""
-    try:
-        rows = np.atleast_2d(np.asarray(points, float))
-    except ValueError:
-        rows = np.empty((0, 0))
-    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
-        raise SettingError(f"seed_point: expected three numbers, or several times three, got {points!r}")
-    return rows
 
 
 def fit(
@@ -253,7 +237,7 @@ def fit(
         if value is not None and value < least:
             raise SettingError(f"{name}: expected {least} or more, got {value}")
     direction = parse_up(up)
-    seed_points = None if seed_point is None else _parse_points(seed_point)
+    seed_points = None if seed_point is None else parse_points(seed_point)
     species = species if isinstance(species, Species) else load_species(os.fspath(species))
     if not isinstance(cloud, PointCloud):
         cloud = from_points(cloud, units)

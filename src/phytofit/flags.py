@@ -33,7 +33,7 @@ MUCH_NOISE_CM = 1.0
 BLURRED = 2.0  # stem noises in a stem's radius, below which a tube can't be told from a filled stem
 EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which the width is not resolved
 IMPLAUSIBLE = 4.0  # spreads of the prior
-BOUNDED = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width")
+BOUNDED = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width", "stem_diameter_above")
 NEAR_BOUND = 1e-6
 TIP_DOUBTFUL = "whether the tip was seen can't be told: the leaf may be longer"
 BEYOND_TIP = "{:.0f} points near the leaf's tip are not explained: the leaf may go on there"
@@ -155,8 +155,11 @@ def density_over(likelihood: CloudLikelihood, state: State, scores: FloatArray) 
     expected = np.convolve(area * found.sum() / area.sum(), SMOOTHING, "same")
     found = np.convolve(found, SMOOTHING, "same")
     ratio = found / np.maximum(expected, 1e-9)
-    expected *= np.quantile(ratio, TYPICAL)
-    ratio /= np.quantile(ratio, TYPICAL)
+    typical = float(np.quantile(ratio, TYPICAL))
+    if typical == 0.0:  # hardly a point is the leaf's
+        return np.ones((m, N_STRIPS))
+    expected *= typical
+    ratio /= typical
     seen = np.flatnonzero((ratio >= 0.5) & (found >= FEW_ON_PIECE))
     middle = 0.5 * (leaf.axis[1:] + leaf.axis[:-1])
     apart = np.hypot(middle[:, 0], middle[:, 1]) > stem.half_width.max() + OFF_STEM * max(state.noise[:2])
@@ -260,7 +263,8 @@ def _against_the_prior(space: ParameterSpace, x: FloatArray, scale: float) -> It
         if p.name not in BOUNDED:
             continue
         value, unit = (x[i] * scale, _length_unit(scale)) if p.unit == "cm" else (x[i], p.unit)
-        if min(x[i] - p.lower, p.upper - x[i]) < NEAR_BOUND:
+        along_stem = p.name == "leaf_angle" and x[i] == p.lower and "leaf_base_bend" in space.names  # as leaves may be
+        if min(x[i] - p.lower, p.upper - x[i]) < NEAR_BOUND and not along_stem:
             yield f"{p.name} lies at its bound, {value:.3g} {unit}"
         elif abs(x[i] - p.mean) > IMPLAUSIBLE * p.std:
             yield f"{p.name} is implausible for the species: {value:.3g} {unit}"

@@ -1,6 +1,6 @@
 """The most probable phytomer of a cloud, and how well the cloud determines it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor
-from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
-from phytofit.dependence import Dependence, score_dependence
+from phytofit.beginnings import along_points, lower_insertion, turned_blade
+from phytofit.dependence import Dependence, score_dependence, width_misfit
 from phytofit.distances import Reference, quantile_hausdorff
-from phytofit.flags import Sighting, across_leaf, density_over, sighting
+from phytofit.flags import Sighting, density_over, sighting
 from phytofit.likelihood import THICKNESS, CloudLikelihood, Evaluation, State
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
@@ -26,17 +26,14 @@ __all__ = ["DITHER_CM", "Estimate", "estimate"]
 FloatArray = NDArray[np.float64]
 COARSE_POINTS = 700  # that decide which start is the best
 START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some cm off is drawn in
-CUT_SHARE = 0.85  # of the midrib, from which the search for a missing tip starts
+CUT_SHARES = (0.85, 0.97)  # of the midrib, from which the search for a missing tip starts; the second of rich leaves
 DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its eleven parameters gain five by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
+RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
-TURNED = 30.0  # degrees from level, from which a blade is also begun turned
 LOWER_ROUNDS = 3
-LOWER, LEAST_LOWER_CM = 0.12, 2.0  # of the leaf's length, by which its insertion is also tried lower down
-PRIOR_CM = 0.2  # by which its midrib may be moved to make it a spread of the prior more plausible
-LEAST_ACROSS = 20  # points that say how a half of it lies
 LEAST_LEFT = 1.0 / 3.0  # of the residuals' degrees of freedom
 STEP = 0.02  # of a parameter's standard error, for differences of the gradient
 
@@ -50,7 +47,9 @@ class Estimate:
     leaf and outliers; ``seen``: share of the midrib that was seen, 1 unless the tip is missing; ``tip_seen``: whether
     it clearly is not; ``log_p`` (n,) of the points; ``evidence``: Laplace's approximation of the log probability of
     the cloud, up to a constant of the cloud; ``inflation``: how many times more the errors vary than those of
-    independent points would; ``correlated_cm``: how far errors of neighbours are correlated, 0 if they are not;
+    independent points would; ``misfit_cm``: how far the blade's surface lies off the model's, as the errors that
+    neighbours share say; ``width_misfit``: by what share its width is off the model's, place by place;
+    ``correlated_cm``: how far errors of neighbours are correlated, 0 if they are not;
     ``quantile``: standard errors to either side of a 95 % interval, Student's; ``sighting``: what of the phytomer the
     cloud shows; ``dithered``: whether noise was added to the points, which had none.
     """
@@ -66,6 +65,8 @@ class Estimate:
     error: float
     evidence: float
     inflation: float
+    misfit_cm: float
+    width_misfit: float
     correlated_cm: float
     quantile: float
     converged: bool
@@ -192,83 +193,27 @@ def _candidates(plain: Species, species: Species, cloud: _Cloud, state: State) -
         return found
     simple = found[1] if found[1].fit_of_points - found[0].fit_of_points > TIP_MISSING else found[0]
     if _promise(species, simple, cloud) > SHAPE_PROMISE:
-        begun = [found[0].state, *_turned_blade(species, found[0])]
+        begun = [found[0].state, *turned_blade(species, found[0].likelihood, found[0].state)]
         best = max((_end(species, it, cloud, thick=True) for it in begun), key=lambda end: end.fit_of_points)
+        best = _better(species, cloud, best, along_points(species, best.likelihood, best.state))
         for _ in range(LOWER_ROUNDS):
-            lower = [_end(species, it, cloud, thick=True) for it in _lower_insertion(species, best.state)]
-            if not lower or lower[0].fit_of_points < best.fit_of_points + TIP_MISSING:
+            lower = _better(species, cloud, best, lower_insertion(species, best.state))
+            if lower is best:
                 break
-            best = lower[0]
+            best = lower
         found.append(best)
-        found.append(_end(species, _cut(found[2].state), cloud, thick=True, cut=True))
+        cut = [_end(species, _cut(best.state, share), cloud, thick=True, cut=True) for share in CUT_SHARES]
+        found.append(max(cut, key=lambda end: end.fit_of_points))
     return found
 
 
-def _turned_blade(species: Species, end: _End) -> list[State]:
-    """The state with its blade turned about the midrib as the leaf's points lie across it, where that is far from
-    level: a blade on edge is a local optimum of a level one."""
-    names = species.space.names
-    if "leaf_twist" not in names:
-        return []
-    likelihood, state = end.likelihood, end.state
-    at = likelihood.evaluate(state)
-    on_leaf = 1.0 - at.scores[:, -2] - state.share[0] - at.scores[:, -1] - state.share[2] > 0.5
-    place, across = across_leaf(likelihood, state)
-    turn = np.zeros(2)
-    spread = np.zeros((2, 2))
-    for half in range(2):
-        those = across[on_leaf & (place >= 0.5 * half) & (place <= 0.5 * (half + 1))]
-        if len(those) < LEAST_ACROSS:
-            return []
-        moment = np.cov(those.T)
-        turn[half] = 0.5 * np.rad2deg(np.arctan2(2.0 * moment[0, 1], moment[0, 0] - moment[1, 1]))
-        spread[half] = np.sqrt(np.linalg.eigvalsh(moment))
-    twist = 2.0 * ((turn[1] - turn[0] + 90.0) % 180.0 - 90.0)
-    roll = turn[0] - 0.25 * twist
-    if max(abs(turn)) < TURNED:
-        return []
-    theta = state.theta.copy()
-    x = np.concatenate([state.x, species.space.mean[state.n_parameters :]])
-    x[names.index("leaf_roll")], x[names.index("leaf_twist")] = roll, twist
-    x[names.index("leaf_width")] = 2.0 * np.sqrt(3.0) * spread[:, 1].max()  # as of a uniform strip
-    theta[-4] = np.log(spread[:, 0].mean())
-    inside = np.clip(x, species.space.lower, species.space.upper)
-    return [State(np.concatenate([inside, theta[state.n_parameters :]]), state.pose, state.center)]
-
-
-def _lower_insertion(species: Species, state: State) -> list[State]:
-    """The state with a leaf that leaves the stem lower down, along it at first, and then lies where it lay: a leaf that
-    hugs the stem is a local optimum away from one that leaves it higher up, at once."""
-    space, k, x = species.space, state.n_parameters, state.x
-    drop = min(LOWER * x[3], x[1] - space.lower[1])
-    if drop < LEAST_LOWER_CM:
-        return []
-    tip = np.linspace(0.0, (1.0 - LOWER) * x[3], 12)  # lengths from the tip, at which the leaf stays where it is
-    nodes = np.linspace(1.0, 0.0, species.model.n_pieces + 1)
-    bent = ("leaf_angle", "leaf_length", "leaf_rotate_angle", "leaf_bow", "leaf_wave")
-    changed = [space.index(name) for name in bent if name in space.names]
-
-    def midrib(x: FloatArray) -> FloatArray:
-        axis = species.model.organs(x)[1].axis[0][::-1]
-        return np.stack([np.interp(tip, nodes[::-1] * x[3], column) for column in axis.T])
-
-    def lowered(values: FloatArray) -> FloatArray:
-        other = x.copy()
-        other[1], other[6], other[space.index("collar_offset")] = x[1] - drop, x[6] + drop, 1.0
-        other[changed] = values
-        return np.clip(other, space.lower, space.upper)
-
-    there = midrib(x)
-
-    def misfit(values: FloatArray) -> FloatArray:
-        surprise = (values - space.mean[changed]) / space.std[changed]
-        residuals: FloatArray = np.concatenate([(midrib(lowered(values)) - there).ravel(), PRIOR_CM * surprise])
-        return residuals
-
-    begun = x[changed]
-    begun[:2] += -0.5 * x[2], drop
-    found = lowered(least_squares(misfit, begun, method="lm", x_scale=space.std[changed]).x)
-    return [State(np.concatenate([found, state.theta[k:]]), state.pose, state.center)]
+def _better(species: Species, cloud: _Cloud, best: _End, begun: Iterable[State]) -> _End:
+    """Of the best so far and what other beginnings lead to, that which clearly fits better."""
+    for state in begun:
+        end = _end(species, state, cloud, thick=True)
+        if end.fit_of_points > best.fit_of_points + TIP_MISSING:
+            best = end
+    return best
 
 
 def _choice(found: Sequence[_End]) -> _Chosen:
@@ -277,7 +222,8 @@ def _choice(found: Sequence[_End]) -> _Chosen:
     dependence = score_dependence(found[-1].likelihood, found[-1].state)  # the richest: least misfit
     fits = [end.fit_of_points / dependence.inflation for end in found]
     gains = [fits[i | 1] - fits[i & ~1] for i in range(len(found))]
-    evidence = [_evidence(end, dependence.inflation) for end in found]
+    odds = [0.0, 0.0, RARE, RARE]
+    evidence = [_evidence(end, dependence.inflation) + o for end, o in zip(found, odds, strict=False)]
     backed = [e if i % 2 == 0 or gains[i] > TIP_MISSING else -np.inf for i, e in enumerate(evidence)]
     best = int(np.argmax(backed))
     if best < len(found) - 1:
@@ -333,11 +279,11 @@ def _promise(species: Species, end: _End, cloud: _Cloud) -> float:
     return 0.5 * float(gradient[free] @ np.linalg.solve(information[np.ix_(free, free)], gradient[free]))
 
 
-def _cut(state: State) -> State:
+def _cut(state: State, share: float = CUT_SHARES[0]) -> State:
     """The state with a longer leaf, of which as much is seen as of the one that it had."""
     theta = state.theta.copy()
-    theta[[3, 5]] /= CUT_SHARE  # the bend is a thirtieth of the leaf's
-    theta[state.n_parameters] = CUT_SHARE
+    theta[[3, 5]] /= share  # the bend is a thirtieth of the leaf's
+    theta[state.n_parameters] = share
     return State(theta, state.pose, state.center)
 
 
@@ -348,7 +294,7 @@ def _at_junction(mean: FloatArray, pose: FloatArray) -> FloatArray:
     return at
 
 
-def _refined(likelihood: CloudLikelihood, state: State, max_iterations: int = 60) -> Refined:
+def _refined(likelihood: CloudLikelihood, state: State, max_iterations: int = 100) -> Refined:
     def evaluate(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         return _terms(likelihood, likelihood.with_theta(state, theta))
 
@@ -417,6 +363,8 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         error=at.error,
         evidence=chosen.evidence,
         inflation=dependence.inflation,
+        misfit_cm=float(np.sqrt(dependence.correlation) * np.hypot(*state.noise[1:])),
+        width_misfit=width_misfit(likelihood, state),
         correlated_cm=dependence.reach_cm,
         quantile=float(stdtrit(left, 0.975)),
         converged=end.converged,

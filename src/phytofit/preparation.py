@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -13,9 +13,10 @@ from phytofit.errors import SettingError
 from phytofit.pose import StartPose, start_poses
 from phytofit.species import Species
 
-__all__ = ["Prepared", "prepare"]
+__all__ = ["AXES", "Prepared", "parse_points", "parse_up", "prepare"]
 
 FloatArray = NDArray[np.float64]
+AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 STEM_MARGIN, STEM_MARGIN_CM = 1.3, 1.0  # of its radius, and more, around a stem within which points are the stem's
 LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
 LEAST_PIECE = 30  # points; fewer are no piece of anything, and are left to be told for outliers
@@ -149,3 +150,29 @@ def _expected_size(species: Species) -> float:
     """Size, as :func:`size_cm` takes it, of the phytomer that the prior expects."""
     nodes = np.concatenate([o.axis[0] for o in species.model.organs(species.space.mean)])
     return size_cm(nodes)
+
+
+def parse_up(up: str | ArrayLike | None) -> FloatArray | None:
+    """A unit vector (3,) from ``"x" .. "-z"`` or three numbers; None stays None."""
+    if up is None:
+        return None
+    if isinstance(up, str):
+        if up not in AXES:
+            raise SettingError(f"up: expected one of {', '.join(AXES)}, got {up!r}")
+        return np.array(AXES[up], float)
+    vector = np.asarray(up, float)
+    if vector.shape != (3,) or not np.isfinite(vector).all() or not np.any(vector):
+        raise SettingError(f"up: expected three numbers that are not all zero, got {up!r}")
+    unit: FloatArray = vector / np.linalg.norm(vector)
+    return unit
+
+
+def parse_points(points: ArrayLike) -> FloatArray:
+    """(k, 3) of one or more points."""
+    try:
+        rows = np.atleast_2d(np.asarray(points, float))
+    except ValueError:
+        rows = np.empty((0, 0))
+    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
+        raise SettingError(f"seed_point: expected three numbers, or several times three, got {points!r}")
+    return rows

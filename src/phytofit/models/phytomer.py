@@ -11,6 +11,7 @@ __all__ = ["Phytomer"]
 
 FloatArray = NDArray[np.float64]
 COLLAR_CM = 0.5  # above and below the junction, where the stem's diameter changes, if it does
+BASE_SHARE = 0.05  # of the midrib, over which the bend of its base falls to 1 / e
 UPRIGHT = frames_along(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.0, 1.0, 0.0]))
 
 
@@ -41,6 +42,7 @@ class Phytomer:
     leaf_widest_at         share of the midrib, from its start; ``widest_share``
     leaf_taper             -     ``concavity``
     stem_diameter_above    share of the stem's diameter, above the leaf: its sheath ends there
+    leaf_base_bend         deg   that the midrib turns down close to its start, over a twentieth of it or so
     ====================== ===== =================================================================================
     """
 
@@ -68,13 +70,14 @@ class Phytomer:
         "leaf_widest_at",
         "leaf_taper",
         "stem_diameter_above",
+        "leaf_base_bend",
     )
-    UNITS = ("cm", "cm", "deg", "cm", "cm", "deg", "cm", "share", *["deg"] * 6, "share", "share", "1", "share")
+    UNITS = ("cm", "cm", "deg", "cm", "cm", "deg", "cm", "share", *["deg"] * 6, "share", "share", "1", "share", "deg")
 
     @property
     def neutral(self) -> FloatArray:
         """Values (k,) of the parameters; those after the sixth give the paper's model."""
-        return np.array([*[np.nan] * 6, *[0.0] * 8, 1.0, self.widest_share, self.concavity, 1.0])
+        return np.array([*[np.nan] * 6, *[0.0] * 8, 1.0, self.widest_share, self.concavity, 1.0, 0.0])
 
     def width_profile(
         self, base: FloatArray | None = None, widest: FloatArray | None = None, taper: FloatArray | None = None
@@ -113,8 +116,8 @@ class Phytomer:
         n, given = xs.shape
         rest = np.broadcast_to(self.neutral[given:], (n, len(self.PARAMETERS) - given))
         diameter, below, leaf_angle, leaf_length, leaf_width, rotate, above, offset, *shape = np.hstack([xs, rest]).T
-        bow, wave, side_bend, side_bow, roll, twist, *profile, ratio = shape
-        if given < len(self.PARAMETERS):
+        bow, wave, side_bend, side_bow, roll, twist, *profile, ratio, base_bend = shape
+        if given <= self.PARAMETERS.index("stem_diameter_above"):
             height, half_width = (
                 np.stack([0.0 * below, below + above], 1),
                 np.repeat(0.5 * diameter[:, np.newaxis], 2, 1),
@@ -129,7 +132,9 @@ class Phytomer:
 
         s = np.arange(self.n_pieces) / (self.n_pieces - 1)  # 0 at the first segment, 1 at the last
         hump, swing = 4.0 * s * (1.0 - s), 10.392304845413264 * s * (1.0 - s) * (1.0 - 2.0 * s)  # of height 1
-        pitch = np.deg2rad(self.midrib_angles(leaf_angle, rotate) + np.outer(bow, hump) + np.outer(wave, swing))
+        turned = 1.0 - np.exp(-s / BASE_SHARE)
+        bent = np.outer(bow, hump) + np.outer(wave, swing) + np.outer(base_bend, turned)
+        pitch = np.deg2rad(self.midrib_angles(leaf_angle, rotate) + bent)
         yaw = np.deg2rad(np.outer(side_bend, s) + np.outer(side_bow, hump))
         frame = _turned(pitch, yaw, np.deg2rad(roll[:, np.newaxis] + np.outer(twist, s)))
         midrib = np.zeros((n, self.n_pieces + 1, 3))
@@ -150,7 +155,15 @@ class Phytomer:
         names = cls.PARAMETERS[: len(x)]
         turn = np.eye(len(x))
         turn[[1, 6]] = turn[[6, 1]]  # what was below the leaf is above it
-        for name in ("leaf_angle", "leaf_rotate_angle", "leaf_bow", "leaf_wave", "leaf_side_bend", "leaf_side_bow"):
+        for name in (
+            "leaf_angle",
+            "leaf_rotate_angle",
+            "leaf_bow",
+            "leaf_wave",
+            "leaf_side_bend",
+            "leaf_side_bow",
+            "leaf_base_bend",
+        ):
             if name in names:
                 turn[names.index(name), names.index(name)] = -1.0
         offset = np.zeros(len(x))
