@@ -47,7 +47,7 @@ def test_the_start_with_a_turned_blade_is_turned_as_the_points_lie():
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
     start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(made.x[:7], np.eye(4), 1.0)
     end = _end(plain, start, _Cloud(points, None, None))
-    (turned,) = turned_blade(SPECIES, end.likelihood, end.state)
+    (turned,) = turned_blade(SPECIES, end.likelihood, end.state, end.at.scores)
     assert turned.x[NAMES.index("leaf_roll")] == pytest.approx(60.0, abs=15.0)
     assert turned.x[NAMES.index("leaf_twist")] == pytest.approx(30.0, abs=25.0)
 
@@ -58,7 +58,7 @@ def test_a_level_blade_is_not_begun_turned():
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
     start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(made.x[:7], np.eye(4), 1.0)
     end = _end(plain, start, _Cloud(points, None, None))
-    assert list(turned_blade(SPECIES, end.likelihood, end.state)) == []
+    assert list(turned_blade(SPECIES, end.likelihood, end.state, end.at.scores)) == []
 
 
 def test_a_sheath_that_ends_at_the_collar():
@@ -103,12 +103,13 @@ def test_a_leaf_that_curls_back_is_begun_along_its_points():
     x = made.x.copy()
     x[[3, 5]] = 45.0, 1.0
     state = likelihood.start(x, np.eye(4), 0.5)
-    (along,) = along_points(SPECIES, likelihood, state)
+    (along,) = along_points(SPECIES, likelihood, state, likelihood.evaluate(state).scores)
     assert along.x[3] == pytest.approx(70.0, abs=4.0)
     there, true = (SPECIES.model.organs(it)[1].axis[0] for it in (along.x, made.x))
     assert np.linalg.norm(there[5:] - true[5:], axis=1).max() < 4.0
     assert np.linalg.norm(SPECIES.model.organs(x)[1].axis[0, -1] - true[-1]) > 20.0
-    assert list(along_points(SPECIES, likelihood, likelihood.start(made.x, np.eye(4), 0.5))) == []
+    state = likelihood.start(made.x, np.eye(4), 0.5)
+    assert list(along_points(SPECIES, likelihood, state, likelihood.evaluate(state).scores)) == []
 
 
 def test_a_leaf_in_pieces_has_no_line():
@@ -116,7 +117,8 @@ def test_a_leaf_in_pieces_has_no_line():
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
     scarce = np.concatenate([points[made.labels == 1], points[made.labels == 2][:15]])
     likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, scarce)
-    assert list(along_points(SPECIES, likelihood, likelihood.start(made.x, np.eye(4), 0.5))) == []
+    state = likelihood.start(made.x, np.eye(4), 0.5)
+    assert list(along_points(SPECIES, likelihood, state, likelihood.evaluate(state).scores)) == []
 
 
 def test_points_beyond_the_tip_are_flagged_and_open_the_length():

@@ -27,14 +27,13 @@ SIDEWAYS = ("leaf_side_bend", "leaf_side_bow")
 BENT = ("leaf_angle", "leaf_length", "leaf_rotate_angle", "leaf_bow", "leaf_wave", "leaf_base_bend")
 
 
-def turned_blade(species: Species, likelihood: CloudLikelihood, state: State) -> Iterator[State]:
+def turned_blade(species: Species, likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Iterator[State]:
     """The state with its blade turned about the midrib as the leaf's points lie across it, where that is far from
     level: a blade on edge is a local optimum of a level one."""
     names = species.space.names
     if "leaf_twist" not in names:
         return
-    at = likelihood.evaluate(state)
-    on_leaf = 1.0 - at.scores[:, -2] - state.share[0] - at.scores[:, -1] - state.share[2] > 0.5
+    on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2] > 0.5
     place, across = across_leaf(likelihood, state)
     turn = np.zeros(2)
     spread = np.zeros((2, 2))
@@ -73,13 +72,12 @@ def lower_insertion(species: Species, state: State, share: float = LOWER) -> Ite
     yield _with_x(state, _following(species, other, bent, there, from_tip))
 
 
-def along_points(species: Species, likelihood: CloudLikelihood, state: State) -> Iterator[State]:
+def along_points(species: Species, likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Iterator[State]:
     """The state with a midrib that follows the leaf's points from the stem to their end, where it now leaves them: what
     a leaf that bends sharply, or curls back, needs."""
     space, k = species.space, state.n_parameters
-    at = likelihood.evaluate(state)
     pose = likelihood.pose_of(state)
-    points = ((likelihood.points - pose[:3, 3]) @ pose[:3, :3])[at.scores[:, -2] + state.share[0] < 0.5]
+    points = ((likelihood.points - pose[:3, 3]) @ pose[:3, :3])[scores[:, -2] + state.share[0] < 0.5]
     line, from_tip = _line_of(points[:: max(1, len(points) // N_WALKED)], state)
     if not len(line):
         return

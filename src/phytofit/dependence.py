@@ -9,6 +9,7 @@ from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
 from phytofit.flags import across_leaf
+from phytofit.kernels.neighbors import sum_by_distance
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import Organ, move
 
@@ -99,12 +100,11 @@ def _change_of_scores(likelihood: CloudLikelihood, state: State, direction: Floa
     return (there - back) / (2.0 * SHIFT)
 
 
-def width_misfit(likelihood: CloudLikelihood, state: State) -> float:
+def width_misfit(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> float:
     """Standard deviation of the leaf's width about the model's, place by place, as a share of it, beyond chance.
 
     Points that are uniform across a strip vary by a third of its half width squared, and by the noise.
     """
-    scores = likelihood.evaluate(state).scores
     on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2] > 0.5
     leaf = likelihood.model.organs(state.x)[1].row(0)
     lengths = leaf.segment_lengths
@@ -128,13 +128,9 @@ def width_misfit(likelihood: CloudLikelihood, state: State) -> float:
 def _local(organs: tuple[Organ, ...], points: FloatArray, on_stem: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """Frames (n, 3, 3), columns along, across, normal, of the surface near each point, and distances (n,) from it."""
     stem, leaf = organs
-    length = leaf.segment_lengths
-    offset = points[:, np.newaxis] - leaf.axis[:-1]
-    along = np.clip(np.einsum("nmi,mi->nm", offset, leaf.frame[:, :, 0]), 0.0, length)
-    gap = offset - along[..., np.newaxis] * leaf.frame[:, :, 0]
-    j = np.argmin(np.einsum("nmi,nmi->nm", gap, gap), axis=1)
-    frame = leaf.frame[j]
-    distance = np.einsum("ni,ni->n", offset[np.arange(len(points)), j], frame[:, :, 2])
+    piece, _ = leaf.nearest(points)
+    frame = leaf.frame[piece]
+    distance = np.einsum("ni,ni->n", points - leaf.axis[piece], frame[:, :, 2])
     axis = stem.frame[0, :, 0]
     radial = points[on_stem] - stem.axis[0]
     height, nodes = radial @ axis, np.concatenate([[0.0], np.cumsum(stem.segment_lengths)])
@@ -152,14 +148,10 @@ def _correlation(points: FloatArray, errors: FloatArray) -> tuple[float, float]:
     if len(points) < 2:
         return 0.0, 0.0
     probed = np.unique(np.linspace(0, len(points) - 1, N_PROBED).astype(int))
-    near = cKDTree(points).query_ball_point(points[probed], LONGEST_CM)
-    first = np.repeat(probed, [len(those) for those in near])
-    second = np.concatenate([np.asarray(those, int) for those in near])
-    first, second = first[first != second], second[first != second]
-    lag = (np.linalg.norm(points[first] - points[second], axis=1) / LAG_CM).astype(int)
-    n = int(LONGEST_CM / LAG_CM) + 1
-    count = np.bincount(lag, minlength=n).astype(float)
-    mean = np.bincount(lag, errors[first] * errors[second], n) / np.maximum(count, 1.0) / np.mean(errors**2)
+    n = int(LONGEST_CM / LAG_CM)
+    count, total = np.empty(n), np.empty(n)
+    sum_by_distance(points, errors, probed, LAG_CM, count, total)
+    mean = total / np.maximum(count, 1.0) / np.mean(errors**2)
     middle = (np.arange(n) + 0.5) * LAG_CM
     twice = 2.0 if len(probed) == len(points) else 1.0  # each pair was met twice
     best, found = np.inf, (0.0, 0.0)

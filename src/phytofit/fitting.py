@@ -400,7 +400,7 @@ def _remarked(result: Fit) -> Fit:
     made = result.estimate
     if made is None:
         return result
-    length = next(t.value for t in result.traits if t.name == "leaf_length")
+    length = next(t.value for t in result._measured(result.x) if t.name == "leaf_length")
     if made.sighting.stem_points < LEAST_ON_STEM or length <= 0.0:
         raise NoPhytomerError(
             f"no stem with a leaf was found: the best fit has {made.sighting.stem_points:.0f} points on its stem and a "

@@ -111,7 +111,7 @@ def _upper_spread(values: FloatArray) -> float:
 
 def _strip(leaf: Organ, points: FloatArray) -> NDArray[np.intp]:
     """Strip (n,) of the blade that is nearest to each point, from its right edge."""
-    j, along = _place(leaf, points)
+    j, along = leaf.nearest(points)
     lateral = np.einsum("ni,ni->n", points - leaf.axis[j], leaf.frame[j][:, :, 1])
     slope = (leaf.half_width[j + 1] - leaf.half_width[j]) / leaf.segment_lengths[j]
     half = np.maximum(leaf.half_width[j] + slope * along, 1e-9)
@@ -149,7 +149,7 @@ def density_over(likelihood: CloudLikelihood, state: State, scores: FloatArray) 
     points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]
     stem, leaf = (organ.row(0) for organ in likelihood.model.organs(state.x))
     area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
-    piece, _ = _place(leaf, points)
+    piece, _ = leaf.nearest(points)
     m = len(area)
     found = np.bincount(piece, np.where(on_leaf > 0.5, on_leaf, 0.0), m).astype(float)
     expected = np.convolve(area * found.sum() / area.sum(), SMOOTHING, "same")
@@ -185,7 +185,7 @@ def across_leaf(likelihood: CloudLikelihood, state: State) -> tuple[FloatArray, 
     pose = likelihood.pose_of(state)
     points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]
     leaf = likelihood.model.organs(state.x)[1].row(0)
-    j, along = _place(leaf, points)
+    j, along = leaf.nearest(points)
     lengths = leaf.segment_lengths
     place = (np.concatenate([[0.0], np.cumsum(lengths)])[j] + along) / lengths.sum()
     return place, np.einsum("nib,ni->nb", leaf.frame[j][:, :, 1:], points - leaf.axis[j])
@@ -194,21 +194,12 @@ def across_leaf(likelihood: CloudLikelihood, state: State) -> tuple[FloatArray, 
 def _area_share(leaf: Organ, points: FloatArray) -> FloatArray:
     """Share (n,) of the leaf's area that lies nearer to its base than each point."""
     assert leaf.kind == LEAF
-    j, along = _place(leaf, points)
+    j, along = leaf.nearest(points)
     area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
     before = np.concatenate([[0.0], np.cumsum(area)])
     passed = before[j] + along / leaf.segment_lengths[j] * area[j]
     share: FloatArray = passed / before[-1]
     return share
-
-
-def _place(leaf: Organ, points: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-    """The piece (n,) of the midrib that is nearest to each point, and how far (n,) along it, cm."""
-    offset = points[:, np.newaxis] - leaf.axis[:-1]
-    along = np.clip(np.einsum("nmi,mi->nm", offset, leaf.frame[:, :, 0]), 0.0, leaf.segment_lengths)
-    gap = offset - along[..., np.newaxis] * leaf.frame[:, :, 0]
-    j = np.argmin(np.einsum("nmi,nmi->nm", gap, gap), axis=1)
-    return j, along[np.arange(len(points)), j]
 
 
 def flags_of(

@@ -139,16 +139,17 @@ class _Cloud(NamedTuple):
 
 
 class _End(NamedTuple):
-    """Where a refinement ended."""
+    """Where a refinement ended, evaluated there."""
 
     likelihood: CloudLikelihood
     state: State
+    at: Evaluation
     converged: bool
 
     @property
     def fit_of_points(self) -> float:
         """Log probability of the points."""
-        return float(self.likelihood.evaluate(self.state, derivatives=False).log_p.sum())
+        return float(self.at.log_p.sum())
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -193,9 +194,9 @@ def _candidates(plain: Species, species: Species, cloud: _Cloud, state: State) -
         return found
     simple = found[1] if found[1].fit_of_points - found[0].fit_of_points > TIP_MISSING else found[0]
     if _promise(species, simple, cloud) > SHAPE_PROMISE:
-        begun = [found[0].state, *turned_blade(species, found[0].likelihood, found[0].state)]
+        begun = [found[0].state, *turned_blade(species, found[0].likelihood, found[0].state, found[0].at.scores)]
         best = max((_end(species, it, cloud, thick=True) for it in begun), key=lambda end: end.fit_of_points)
-        best = _better(species, cloud, best, along_points(species, best.likelihood, best.state))
+        best = _better(species, cloud, best, along_points(species, best.likelihood, best.state, best.at.scores))
         for _ in range(LOWER_ROUNDS):
             lower = _better(species, cloud, best, lower_insertion(species, best.state))
             if lower is best:
@@ -247,10 +248,11 @@ def _end(species: Species, state: State, cloud: _Cloud, *, thick: bool = False, 
         state = likelihood.extended(state)
         end = _refined(likelihood, state)
         state = State(end.theta, state.pose, state.center)
-        density = density_over(likelihood, state, likelihood.evaluate(state).scores)
+        at = likelihood.evaluate(state)
+        density = density_over(likelihood, state, at.scores)
         if np.allclose(density, likelihood.density, atol=0.05):
             break
-    return _End(likelihood, state, end.converged)
+    return _End(likelihood, state, at, end.converged)
 
 
 def _dithered(points: FloatArray, seed: int) -> FloatArray:
@@ -329,8 +331,7 @@ def _evidence(end: _End, inflation: float) -> float:
 
     Points whose errors depend on each other count as `inflation` times fewer.
     """
-    likelihood, theta, free = end.likelihood, end.state.theta, end.free
-    at = likelihood.evaluate(end.state)
+    likelihood, theta, free, at = end.likelihood, end.state.theta, end.free, end.at
     precision = likelihood.precision[free]
     information = (at.scores.T @ at.scores)[np.ix_(free, free)] / inflation + np.diag(precision)
     surprise = 0.5 * np.sum((theta - likelihood.mean) ** 2 * likelihood.precision)
@@ -340,11 +341,10 @@ def _evidence(end: _End, inflation: float) -> float:
 
 def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: bool) -> Estimate:
     end, dependence = chosen.end, chosen.dependence
-    likelihood, state, free = end.likelihood, end.state, end.free
+    likelihood, state, free, at = end.likelihood, end.state, end.free, end.at
     k = state.n_parameters
-    at = likelihood.evaluate(state)
     covariance = np.zeros((len(free), len(free)))
-    inverse = np.linalg.inv(_curvature(end, at))
+    inverse = np.linalg.inv(_curvature(end))
     left = max(
         dependence.n_independent - free.sum(), LEAST_LEFT * dependence.n_independent
     )  # a fit takes some errors up
@@ -364,7 +364,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         evidence=chosen.evidence,
         inflation=dependence.inflation,
         misfit_cm=float(np.sqrt(dependence.correlation) * np.hypot(*state.noise[1:])),
-        width_misfit=width_misfit(likelihood, state),
+        width_misfit=width_misfit(likelihood, state, at.scores),
         correlated_cm=dependence.reach_cm,
         quantile=float(stdtrit(left, 0.975)),
         converged=end.converged,
@@ -374,10 +374,10 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     )
 
 
-def _curvature(end: _End, at: Evaluation) -> FloatArray:
+def _curvature(end: _End) -> FloatArray:
     """Second derivatives of the error by the free entries of theta, by differences of the gradient; the information
     where they are not positive definite."""
-    likelihood, state, free = end.likelihood, end.state, np.flatnonzero(end.free)
+    likelihood, state, at, free = end.likelihood, end.state, end.at, np.flatnonzero(end.free)
     gradient = _gradient(likelihood, state, at)[free]
     information = (at.scores.T @ at.scores + np.diag(likelihood.precision))[np.ix_(free, free)]
     curvature = np.empty_like(information)

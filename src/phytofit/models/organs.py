@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
+from phytofit.kernels.neighbors import nearest_pieces
 from phytofit.kernels.sampling import sample_surfaces
 
 __all__ = ["LEAF", "STEM", "Organ", "SurfaceSampler", "frames_along", "mesh", "move"]
@@ -45,6 +46,13 @@ class Organ:
         """(..., m - 1), cm."""
         lengths: FloatArray = np.linalg.norm(np.diff(self.axis, axis=-2), axis=-1)
         return lengths
+
+    def nearest(self, points: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
+        """The segment (n,) of one organ's axis that is nearest to each of points (n, 3), and how far (n,) along it."""
+        piece, along = np.empty(len(points), np.intp), np.empty(len(points))
+        tangent = np.ascontiguousarray(self.frame[:, :, 0])
+        nearest_pieces(np.ascontiguousarray(points), self.axis[:-1], tangent, self.segment_lengths, piece, along)
+        return piece, along
 
     @property
     def area(self) -> FloatArray:
