@@ -75,10 +75,10 @@ def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0
     log_p = np.empty(n)
     log_density(
         np.array(points, float), np.full(n, organ, np.int8),
-        leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, np.ones((m, 3)), np.zeros((m, 0, 9)),
+        leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, np.ones((m, 3)), np.zeros((m, 9, 0)),
         np.zeros(0),
         stem.axis[:-1], stem.frame, stem.segment_lengths, 0.5 * (stem.half_width[1:] + stem.half_width[:-1]),
-        np.zeros((len(stem.frame), 0, 8)), np.zeros(0),
+        np.zeros((len(stem.frame), 9, 0)), np.zeros(0),
         np.array(noise, float), np.array(share, float), float(outlier_density), log_p, np.empty((0, 5)),
     )  # fmt: skip
     return np.exp(log_p)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from phytofit.kernels.likelihood import LEAF_COLUMNS, STEM_COLUMNS, log_density
+from phytofit.kernels.likelihood import CHANGES, log_density, segment_changes
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
 
@@ -183,41 +183,37 @@ class CloudLikelihood:
     def evaluate(self, state: State, *, derivatives: bool = True) -> Evaluation:
         """The error and, if wanted, the scores (n, k + 12) of a state."""
         k = len(self.space)
-        columns = np.repeat(state.theta[np.newaxis, : k + 1], 2 * k + 3 if derivatives else 1, axis=0)
-        steps = STEP * self.std[: k + 1]
-        if derivatives:
-            columns[1 : k + 2] += np.diag(steps)
-            columns[k + 2 :] -= np.diag(steps)
+        n_steps = k + 1 if derivatives else 0
+        columns = np.repeat(state.theta[np.newaxis, : k + 1], 2 * n_steps + 1, axis=0)
+        steps = STEP * self.std[:n_steps]
+        raised = np.arange(n_steps)
+        columns[1 + raised, raised] += steps
+        columns[1 + n_steps + raised, raised] -= steps
         stem, leaf = self.model.organs(columns[:, :k])
         length, half = _seen(leaf, columns[:, k])
-        pose = self.pose_of(state)
-        r = pose[:3, :3]
-        n_columns = k + 7 if derivatives else 0
-        leaf_change = np.zeros((leaf.frame.shape[1], n_columns, LEAF_COLUMNS))
-        stem_change = np.zeros((stem.frame.shape[1], n_columns, STEM_COLUMNS))
-        area_change, stem_area_change = np.zeros(n_columns), np.zeros(n_columns)
         stem_length = stem.segment_lengths
         radius = 0.5 * (stem.half_width[:, 1:] + stem.half_width[:, :-1])
+        pose = self.pose_of(state)
+        r, t = pose[:3, :3], pose[:3, 3]
+        n_columns = k + 7 if derivatives else 0
+        leaf_change = np.empty((leaf.frame.shape[1], CHANGES, n_columns))
+        stem_change = np.empty((stem.frame.shape[1], CHANGES, n_columns))
+        area_change, stem_area_change = np.zeros(n_columns), np.zeros(n_columns)
         if derivatives:
-            leaf_change[:, : k + 1] = _change(leaf, length, half, steps)
-            stem_change[:, : k + 1, :-1] = _change(stem, stem_length, stem.half_width, steps)[..., :-2]
-            stem_change[:, : k + 1, -1] = _slope(radius, steps).T
-            area_change[: k + 1] = _slope(
-                np.log(np.sum(self.density.mean(1) * length * (half[:, 1:] + half[:, :-1]), 1)), steps
-            )
-            stem_area_change[: k + 1] = _slope(np.log(np.sum(stem_length * radius, 1)), steps)
-            centre_in_model = r.T @ (state.center + state.shift - pose[:3, 3])
-            turning = r.T @ _left_jacobian(state.turn)  # columns: axes of turning, in the model's frame
-            leaf_change[:, k + 1 :, :6] = _pose_change(leaf.axis[0, :-1], leaf.frame[0], turning, r.T, centre_in_model)
-            stem_change[:, k + 1 :, :6] = _pose_change(stem.axis[0, :-1], stem.frame[0], turning, r.T, centre_in_model)
+            # axes of turning, shifts and centre as the model's frame sees them
+            about = r.T @ _left_jacobian(state.turn), r.T, r.T @ (state.center + state.shift - t)
+            segment_changes(leaf.axis, leaf.frame, length, half, steps, *about, leaf_change)
+            segment_changes(stem.axis, stem.frame, stem_length, stem.half_width, steps, *about, stem_change)
+            area = np.sum(self.density.mean(axis=1) * length * (half[:, 1:] + half[:, :-1]), axis=1)
+            area_change[:n_steps] = _slope(np.log(area), steps)
+            stem_area_change[:n_steps] = _slope(np.log(np.sum(stem_length * radius, axis=1)), steps)
         n = len(self.points)
         log_p = np.empty(n)
         scores = np.empty((n if derivatives else 0, k + N_EXTRA))
         arguments = (
-            leaf.axis[0, :-1] @ r.T + pose[:3, 3], r @ leaf.frame[0], length[0], half[0], self.density,
-            leaf_change, area_change,
-            stem.axis[0, :-1] @ r.T + pose[:3, 3], r @ stem.frame[0], stem_length[0], radius[0],
-            stem_change, stem_area_change, state.noise, state.share, self.outlier_density,
+            leaf.axis[0, :-1] @ r.T + t, r @ leaf.frame[0], length[0], half[0], self.density, leaf_change, area_change,
+            stem.axis[0, :-1] @ r.T + t, r @ stem.frame[0], stem_length[0], radius[0], stem_change, stem_area_change,
+            state.noise, state.share, self.outlier_density,
         )  # fmt: skip
 
         def block(first: int) -> None:
@@ -251,45 +247,11 @@ def _seen(leaf: Organ, share: FloatArray) -> tuple[FloatArray, FloatArray]:
     return leaf.segment_lengths * part, half
 
 
-def _change(organ: Organ, length: FloatArray, half: FloatArray, steps: FloatArray) -> FloatArray:
-    """Change (m, k, 9) of each segment per unit of each parameter, in the segment's own frame, by central differences
-    of a population: row 0 as it is, rows 1 .. k with a parameter raised by its step, rows k + 1 .. 2 k lowered."""
-    frame = organ.frame[0]  # (m, 3, 3)
-    shift = np.einsum("mij,kmi->mkj", frame, _slope(organ.axis[:, :-1], steps))
-    turn = np.einsum("mij,kmil->mkjl", frame, _slope(organ.frame, steps))  # skew
-    of_length, of_half = _slope(length, steps).T, _slope(half, steps).T
-    return np.concatenate(
-        [
-            shift,
-            np.stack([turn[..., 2, 1], turn[..., 0, 2], turn[..., 1, 0]], axis=-1),
-            np.stack([of_length, of_half[:-1], of_half[1:]], axis=-1),
-        ],
-        axis=-1,
-    )
-
-
 def _slope(values: FloatArray, steps: FloatArray) -> FloatArray:
-    """Change (k, ...) of values (2 k + 1, ...) of such a population per unit of each parameter."""
-    k = len(steps)
-    both = values[1:].reshape(2, k, *values.shape[1:])
-    difference: FloatArray = (both[0] - both[1]) / (2.0 * steps.reshape(k, *[1] * (values.ndim - 1)))
-    return difference
-
-
-def _pose_change(
-    origin: FloatArray, frame: FloatArray, turning: FloatArray, shifting: FloatArray, center: FloatArray
-) -> FloatArray:
-    """Translation and rotation (m, 6, 6) of segments per unit of turn (3) and shift (3), in their own frames.
-
-    All in the model's frame: origins (m, 3), frames (m, 3, 3), columns of the axes of turning and of the shifts.
-    """
-    arm = origin - center
-    by_turn = np.cross(turning.T[np.newaxis], arm[:, np.newaxis])  # (m, 3 turns, 3)
-    change = np.zeros((len(origin), 6, 6))
-    change[:, :3, :3] = np.einsum("mij,mti->mtj", frame, by_turn)
-    change[:, :3, 3:] = np.einsum("mij,it->mtj", frame, turning)
-    change[:, 3:, :3] = np.einsum("mij,it->mtj", frame, shifting)
-    return change
+    """Change (k,) of values (2 k + 1,) of a population as :func:`segment_changes` takes it, per unit."""
+    high, low = values[1:].reshape(2, len(steps))
+    slope: FloatArray = (high - low) / (2.0 * steps)
+    return slope
 
 
 def _left_jacobian(turn: FloatArray) -> FloatArray:

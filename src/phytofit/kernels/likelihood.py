@@ -1,18 +1,15 @@
 """Density of points that lie on a phytomer's surface, with noise, and its derivatives."""
 
-from math import erf
-
 import numpy as np
 
 from phytofit.kernels.compiling import kernel
 
-__all__ = ["LEAF_COLUMNS", "STEM_COLUMNS", "log_density"]
+__all__ = ["CHANGES", "log_density", "segment_changes"]
 
 REACH = 5.5  # noise levels from a surface at which its density counts as none: e^-15 of the greatest
-LEAF_COLUMNS = 9  # of a leaf segment's change: translation (3), rotation (3), length, half widths at both ends
-STEM_COLUMNS = 8  # of a stem segment's: translation (3), rotation (3), length, radius
+CHANGES = 9  # of a segment: translation (3), rotation (3), length, half widths (a stem's radii) at both ends
 EDGES = np.array([-1.0, -1.0 / 3.0, 1.0 / 3.0, 1.0])  # of the strips of a leaf's segment, in half widths
-ROOT_TWO = np.sqrt(2.0)
+FARTHEST = 8.5  # standard deviations, beyond which a normal density is none: 1e-16
 ROOT_TWO_PI = np.sqrt(2.0 * np.pi)
 
 
@@ -59,15 +56,28 @@ def _bessel(x):
 
 
 @kernel
-def _normal(x, std):
-    z = x / std
-    return np.exp(-0.5 * z * z) / (ROOT_TWO_PI * std)
+def _normal(z):
+    """Probability that a standard normal number lies between 0 and z, negative below 0, and its density at z.
 
-
-@kernel
-def _between(low, high, std):
-    """Probability that a normal number of zero mean lies between two limits."""
-    return 0.5 * (erf(high / (ROOT_TWO * std)) - erf(low / (ROOT_TWO * std)))
+    What lies beyond z is the density times a rational function of z, to 1e-10 of it: a least squares fit.
+    """
+    size = abs(z)
+    if size > FARTHEST:
+        return np.copysign(0.5, z), 0.0
+    bell = np.exp(-0.5 * size * size)
+    share = 1.0 / ((size + 4.0) * (size + 1.0))
+    t = (size - 4.0) * (size + 1.0) * share
+    s = t * t
+    even = 0.472053206485 + s * (
+        0.0139996395984
+        + s * (-0.0321979645691 + s * (-0.0050018708879 + s * (0.00070266075507 - s * 0.000135104776746)))
+    )
+    odd = -0.0967034777153 + s * (
+        0.0286003951387
+        + s * (0.0179353271814 + s * (-0.000278489400423 + s * (-0.000111017173137 - s * 0.000022171402950)))
+    )
+    inside = 0.5 - bell * (even + t * odd) * (size + 4.0) * share
+    return np.copysign(inside, z), bell / ROOT_TWO_PI
 
 
 @kernel
@@ -104,7 +114,7 @@ def log_density(
         left, relative to where all was seen
     stem_origin (s, 3), stem_frame (s, 3, 3) columns tangent and two across, stem_length (s,), stem_radius (s,) : the
         stem's segments
-    leaf_change (m, k, 9), leaf_area_change (k,), stem_change (s, k, 8), stem_area_change (k,) : change of a segment,
+    leaf_change (m, 9, k), leaf_area_change (k,), stem_change (s, 9, k), stem_area_change (k,) : change of a segment,
         in its own frame, and of the logarithm of the organ's area, for a unit change of each
         of k parameters
     noise : (3,) standard deviation: on the stem; on the leaf; and what its thickness adds to that across the blade
@@ -116,12 +126,12 @@ def log_density(
     """
     n = points.shape[0]
     m = leaf_origin.shape[0]
-    k = stem_change.shape[1]
+    k = stem_change.shape[2]
     wanted = scores.shape[0] > 0
     stem_noise, leaf_noise, thickness = noise[0], noise[1], np.hypot(noise[1], noise[2])
-    thin = (leaf_noise / thickness) ** 2
-    reach = REACH * leaf_noise
-    depth = REACH * thickness
+    far, reach, depth = REACH * stem_noise, REACH * leaf_noise, REACH * thickness
+    stem_square, leaf_square = stem_noise * stem_noise, leaf_noise * leaf_noise
+    thin = leaf_square / (thickness * thickness)
     area = 0.0
     for j in range(m):
         mean = (leaf_density[j, 0] + leaf_density[j, 1] + leaf_density[j, 2]) / 3.0
@@ -137,8 +147,6 @@ def log_density(
             for c in range(k + 5):
                 scores[i, c] = 0.0
         if organ[i] != 1:
-            far = REACH * stem_noise
-            square = stem_noise * stem_noise
             for j in range(len(stem_length)):
                 x, y, z = (
                     points[i, 0] - stem_origin[j, 0],
@@ -154,110 +162,112 @@ def log_density(
                 rho = np.sqrt(v * v + w * w)
                 if rho > radius + far or rho < radius - far:
                     continue
-                along = _between(u - length, u, stem_noise)
+                from_foot, at_foot = _normal(u / stem_noise)
+                from_top, at_top = _normal((u - length) / stem_noise)
+                along = from_foot - from_top
                 if along <= 0.0:
                     continue
-                bessel, ratio = _bessel(rho * radius / square)
+                bessel, ratio = _bessel(rho * radius / stem_square)
                 gap = rho - radius
-                around = np.exp(-0.5 * gap * gap / square) * bessel / (2.0 * np.pi * square)
+                around = np.exp(-0.5 * gap * gap / stem_square) * bessel / (2.0 * np.pi * stem_square)
                 density = share[0] * radius / stem_area * around * along
                 if density <= 0.0:
                     continue
                 on_stem += density
                 if wanted:
-                    at_foot, at_top = _normal(u, stem_noise), _normal(u - length, stem_noise)
-                    by_u = (at_foot - at_top) / along
-                    by_length = at_top / along
-                    by_rho = (radius * ratio - rho) / square
-                    by_radius = (rho * ratio - radius) / square + 1.0 / radius
-                    by_noise = (
-                        -2.0
-                        + (rho * rho + radius * radius - 2.0 * rho * radius * ratio) / square
-                        - (u * at_foot - (u - length) * at_top) / along
-                    )
+                    at_foot /= stem_noise * along
+                    at_top /= stem_noise * along
+                    by_u = density * (at_foot - at_top)
+                    by_length = density * at_top
+                    by_rho = density * (radius * ratio - rho) / stem_square
+                    by_half = 0.5 * density * ((rho * ratio - radius) / stem_square + 1.0 / radius)
                     by_v = by_rho * v / rho if rho > 0.0 else 0.0
                     by_w = by_rho * w / rho if rho > 0.0 else 0.0
+                    change = stem_change[j]
                     for c in range(k):
-                        change = stem_change[j, c]
-                        du = -change[0] - (change[4] * w - change[5] * v)
-                        dv = -change[1] - (change[5] * u - change[3] * w)
-                        dw = -change[2] - (change[3] * v - change[4] * u)
-                        scores[i, c] += density * (
-                            by_u * du + by_v * dv + by_w * dw + by_length * change[6] + by_radius * change[7]
+                        scores[i, c] += (
+                            by_length * change[6, c]
+                            + by_half * (change[7, c] + change[8, c])
+                            - by_u * (change[0, c] + change[4, c] * w - change[5, c] * v)
+                            - by_v * (change[1, c] + change[5, c] * u - change[3, c] * w)
+                            - by_w * (change[2, c] + change[3, c] * v - change[4, c] * u)
                         )
-                    scores[i, k] += density * by_noise
+                    scores[i, k] += density * (
+                        -2.0
+                        + (rho * rho + radius * radius - 2.0 * rho * radius * ratio) / stem_square
+                        - (u * at_foot - (u - length) * at_top)
+                    )
         if organ[i] != 0:
-            weight = share[1] / area
             for j in range(m):
                 x, y, z = (
                     points[i, 0] - leaf_origin[j, 0],
                     points[i, 1] - leaf_origin[j, 1],
                     points[i, 2] - leaf_origin[j, 2],
                 )
-                w = leaf_frame[j, 0, 2] * x + leaf_frame[j, 1, 2] * y + leaf_frame[j, 2, 2] * z
-                if w > depth or w < -depth:
-                    continue
                 u = leaf_frame[j, 0, 0] * x + leaf_frame[j, 1, 0] * y + leaf_frame[j, 2, 0] * z
                 length = leaf_length[j]
                 if u < -reach or u > length + reach:
                     continue
+                w = leaf_frame[j, 0, 2] * x + leaf_frame[j, 1, 2] * y + leaf_frame[j, 2, 2] * z
+                if w > depth or w < -depth:
+                    continue
                 v = leaf_frame[j, 0, 1] * x + leaf_frame[j, 1, 1] * y + leaf_frame[j, 2, 1] * z
                 slope = leaf_half[j + 1] - leaf_half[j]
-                if v > max(leaf_half[j], leaf_half[j + 1]) + reach or v < -max(leaf_half[j], leaf_half[j + 1]) - reach:
+                if abs(v) > max(leaf_half[j], leaf_half[j + 1]) + reach:
                     continue
-                along = _between(u - length, u, leaf_noise)
+                from_start, at_start = _normal(u / leaf_noise)
+                from_end, at_end = _normal((u - length) / leaf_noise)
+                along = from_start - from_end
                 if along <= 0.0:
                     continue
+                at_start /= leaf_noise * along
+                at_end /= leaf_noise * along
                 # the half width is taken where the point comes from on average, given u
-                square = leaf_noise * leaf_noise
-                at_start, at_end = _normal(u, leaf_noise), _normal(u - length, leaf_noise)
-                pull = (at_start - at_end) / along
-                s = min(max((u + square * pull) / length, 0.0), 1.0)
+                pull = at_start - at_end
+                s = min(max((u + leaf_square * pull) / length, 0.0), 1.0)
                 half = leaf_half[j] + s * slope
-                across = 0.0
+                across, by_v, by_half, sideways = 0.0, 0.0, 0.0, 0.0
                 for e in range(4):
                     step = _step(leaf_density[j], e)
                     if step != 0.0:
-                        across -= step * 0.5 * erf((half * EDGES[e] - v) / (ROOT_TWO * leaf_noise))
-                density = weight * _normal(w, thickness) * along * across
+                        edge = half * EDGES[e] - v
+                        until_edge, at_edge = _normal(edge / leaf_noise)
+                        at_edge *= step / leaf_noise
+                        across -= step * until_edge
+                        by_v += at_edge
+                        by_half -= EDGES[e] * at_edge
+                        sideways += edge * at_edge
+                bell = np.exp(-0.5 * (w / thickness) ** 2) / (ROOT_TWO_PI * thickness)
+                density = share[1] / area * bell * along * across
                 if density <= 0.0:
                     continue
                 on_leaf += density
                 if wanted:
-                    by_u, by_v, by_half, sideways = pull, 0.0, 0.0, 0.0
-                    for e in range(4):
-                        step = _step(leaf_density[j], e)
-                        if step != 0.0:
-                            edge = half * EDGES[e] - v
-                            at_edge = step * _normal(edge, leaf_noise) / across
-                            by_v += at_edge
-                            by_half -= EDGES[e] * at_edge
-                            sideways += edge * at_edge
-                    by_w = -w / (thickness * thickness)
-                    by_length = at_end / along
-                    spread = (u * at_start - (u - length) * at_end) / along
+                    by_v, by_half, sideways = by_v / across, by_half / across, sideways / across
+                    spread = u * at_start - (u - length) * at_end
                     by_place = by_half * slope / length  # of the place where the half width is taken
-                    by_u += by_place * (1.0 - spread - square * pull * pull)
-                    by_length -= by_place * (((u - length) + square * pull) * at_end / along + s)
                     by_thickness = w * w / (thickness * thickness) - 1.0
                     by_noise = (
                         thin * by_thickness
                         - spread
                         + by_place
-                        * (square * pull * (1.0 + spread) + (u * u * at_start - (u - length) ** 2 * at_end) / along)
+                        * (leaf_square * pull * (1.0 + spread) + u * u * at_start - (u - length) ** 2 * at_end)
                         + sideways
                     )
+                    by_u = density * (pull + by_place * (1.0 - spread - leaf_square * pull * pull))
+                    by_v *= density
+                    by_w = -density * w / (thickness * thickness)
+                    by_length = density * (at_end - by_place * (((u - length) + leaf_square * pull) * at_end + s))
+                    by_first, by_second = density * by_half * (1.0 - s), density * by_half * s
+                    change = leaf_change[j]
                     for c in range(k):
-                        change = leaf_change[j, c]
-                        du = -change[0] - (change[4] * w - change[5] * v)
-                        dv = -change[1] - (change[5] * u - change[3] * w)
-                        dw = -change[2] - (change[3] * v - change[4] * u)
-                        scores[i, c] += density * (
-                            by_u * du
-                            + by_v * dv
-                            + by_w * dw
-                            + by_length * change[6]
-                            + by_half * ((1.0 - s) * change[7] + s * change[8])
+                        scores[i, c] += (
+                            by_length * change[6, c]
+                            + by_first * change[7, c]
+                            + by_second * change[8, c]
+                            - by_u * (change[0, c] + change[4, c] * w - change[5, c] * v)
+                            - by_v * (change[1, c] + change[5, c] * u - change[3, c] * w)
+                            - by_w * (change[2, c] + change[3, c] * v - change[4, c] * u)
                         )
                     scores[i, k + 1] += density * by_noise
                     scores[i, k + 2] += density * (1.0 - thin) * by_thickness
@@ -271,3 +281,56 @@ def log_density(
             scores[i, k + 2] /= p
             scores[i, k + 3] = on_stem / p - share[0]
             scores[i, k + 4] = floor / p - share[2]
+
+
+@kernel
+def segment_changes(axis, frame, length, half, steps, turning, shifting, center, change):
+    """Change of the segments of an organ, each in its own frame, per unit of the parameters, by central differences of
+    a population (row 0 as it is, rows 1 .. k with a parameter raised by its step, rows k + 1 .. 2 k lowered), and per
+    unit of turn and shift of its pose.
+
+    Parameters
+    ----------
+    axis (2 k + 1, m + 1, 3), frame (2 k + 1, m, 3, 3) columns tangent, lateral, normal, length (2 k + 1, m), half
+        (2 k + 1, m + 1) : the organ
+    steps : (k,)
+    turning, shifting (3, 3), center (3,) : columns of the axes of turning, and of the shifts, and the place about
+        which it is turned, in the frame in which the organ is given
+    change : (m, 9, k + 6), filled
+    """
+    k = len(steps)
+    offset, arm = np.empty(3), np.empty(3)
+    for j in range(frame.shape[1]):
+        own = frame[0, j]
+        for c in range(k):
+            high, low, twice = 1 + c, 1 + k + c, 2.0 * steps[c]
+            for a in range(3):
+                offset[a] = (axis[high, j, a] - axis[low, j, a]) / twice
+            for a in range(3):
+                after, last = (a + 1) % 3, (a + 2) % 3
+                change[j, a, c] = own[0, a] * offset[0] + own[1, a] * offset[1] + own[2, a] * offset[2]
+                turn = 0.0
+                for b in range(3):
+                    turn += own[b, last] * (frame[high, j, b, after] - frame[low, j, b, after])
+                change[j, 3 + a, c] = turn / twice
+            change[j, 6, c] = (length[high, j] - length[low, j]) / twice
+            change[j, 7, c] = (half[high, j] - half[low, j]) / twice
+            change[j, 8, c] = (half[high, j + 1] - half[low, j + 1]) / twice
+        for b in range(3):
+            arm[b] = axis[0, j, b] - center[b]
+        for t in range(3):
+            for a in range(3):
+                after, last = (a + 1) % 3, (a + 2) % 3
+                offset[a] = turning[after, t] * arm[last] - turning[last, t] * arm[after]
+            for a in range(3):
+                along, about, shift = 0.0, 0.0, 0.0
+                for b in range(3):
+                    along += own[b, a] * offset[b]
+                    about += own[b, a] * turning[b, t]
+                    shift += own[b, a] * shifting[b, t]
+                change[j, a, k + t] = along
+                change[j, 3 + a, k + t] = about
+                change[j, a, k + 3 + t] = shift
+                change[j, 3 + a, k + 3 + t] = 0.0
+        for a in range(6, 9):
+            change[j, a, k:] = 0.0
