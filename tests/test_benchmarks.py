@@ -120,6 +120,42 @@ def test_the_baseline_without_a_model_measures_a_clean_cloud(seed):
     assert found["leaf_angle"] == pytest.approx(true["leaf_angle"], abs=12.0)
 
 
+def test_a_circle_is_measured_past_a_stub():
+    random = np.random.default_rng(0)
+    turn = random.uniform(0.0, 2.0 * np.pi, 60)
+    ring = np.stack([0.4 + 1.6 * np.cos(turn), -0.3 + 1.6 * np.sin(turn)], axis=1)
+    center, diameter = load("tape_measure").circle(ring)
+    np.testing.assert_allclose(center, [0.4, -0.3], atol=1e-6)
+    assert diameter == pytest.approx(3.2, abs=1e-6)
+    stub = np.array([1.5, -0.3]) + random.uniform(0.8, 1.6, (10, 2)) * [1.0, 0.2]
+    noisy = np.concatenate([ring + random.normal(0.0, 0.05, ring.shape), stub])
+    assert load("tape_measure").circle(noisy)[1] == pytest.approx(3.2, abs=0.1)
+
+
+@pytest.mark.parametrize("gap", [False, True])
+def test_a_tape_follows_an_arc_from_the_stem(gap):
+    """A blade 4 cm wide and 40 cm long, bent to a circle of 20 cm, on a stem of 3 cm; 4 cm of it may be missing."""
+    tool, random = load("tape_measure"), np.random.default_rng(1)
+    s, v = random.uniform(0.0, 40.0, 3000), random.uniform(-2.0, 2.0, 3000)
+    if gap:
+        s, v = s[(s < 20.0) | (s > 24.0)], v[(s < 20.0) | (s > 24.0)]
+    bent = s / 20.0 + np.deg2rad(40.0)
+    foot = np.array([1.5 + 20.0 * np.cos(np.deg2rad(40.0)), 0.0, -20.0 * np.sin(np.deg2rad(40.0))])
+    blade = foot + np.stack([-20.0 * np.cos(bent), v, 20.0 * np.sin(bent)], axis=1)
+    leaf = tool.leaf_of(blade + random.normal(0.0, 0.1, blade.shape), 1.5)
+    tape = tool.tape_along(leaf, 1.5)
+    assert tool.length_of(tape) == pytest.approx(40.0, abs=0.5)
+    chord = np.rad2deg(np.deg2rad(40.0) + 8.0 / 40.0)  # over 8 cm, an arc's chord makes half its turn with the tangent
+    assert tool.angle_over(tape, np.array([0.0, 0.0, 1.0]), 8.0) == pytest.approx(chord, abs=2.0)
+
+
+def test_the_extent_of_a_section_is_that_across_it():
+    tool, random = load("tape_measure"), np.random.default_rng(2)
+    across, off = random.uniform(-3.0, 3.0, 20_000), random.uniform(-0.5, 0.5, 20_000)
+    turned = np.stack([2.0 + 0.8 * across - 0.6 * off, 1.0 + 0.6 * across + 0.8 * off], axis=1)
+    assert tool.extent(turned) == pytest.approx(0.98 * 6.0, abs=0.05)
+
+
 @pytest.mark.skipif(not (BENCHMARKS / "../../shared/data/openalea_synthetic_maize").is_dir(), reason="no data")
 def test_maize_leaves_lie_along_their_true_organs():
     """Noise of 0.3 cm: every point of a leaf within 2 cm of the midrib's half width, or of the stem's surface."""
