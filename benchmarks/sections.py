@@ -24,12 +24,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from scipy.stats import theilslopes
 from tape_measure import (
-    TAPE_DEGREE,
     Ring,
     Section,
     along,
     angle_over,
     direction,
+    expected_beyond,
     leaf_of,
     length_of,
     points_at,
@@ -90,17 +90,17 @@ def cut(result: phytofit.Fit, hand: dict[str, float]) -> Cloud:
     alike = min(chords, key=lambda chord: abs(angle_over(tape, axis, chord) - hand["leaf_angle"]))
     from_axis = length + radius / np.sin(np.deg2rad(angle))
     middle = np.median([section.extent for section in sections if 0.4 < section.at / length < 0.6])
+    beyond = expected_beyond(leaf, blade)
     measured = {
         "stem_diameter": 2.0 * radius,
         "leaf_angle": angle,
         "leaf_length": length,
         "leaf_width": max(section.extent for section in sections),
     }
-    stiffer = length_of(tape_along(leaf, radius, TAPE_DEGREE - 1))
     more = {
         "stem_diameter": f"{len(below)} sections, {min(below):.2f} to {max(below):.2f}",
         "leaf_angle": f"{hand['leaf_angle']:.1f} over {alike:.1f} cm of the tape",
-        "leaf_length": f"a stiffer tape {stiffer:.1f}, from the stem's axis {from_axis:.1f}",
+        "leaf_length": f"from the stem's axis {from_axis:.1f}; the fit expects {beyond:.0f} points beyond",
         "leaf_width": f"half-way along the leaf {middle:.2f}",
     }
     return Cloud(points, blade, start, traits, hand, rings, leaf, tape, sections, measured, more)

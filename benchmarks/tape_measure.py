@@ -26,7 +26,6 @@ LEAST_IN_SECTION = 20  # points
 LINK_CM = 1.0  # points further apart are no neighbours
 LEAST_PIECE = 0.08  # of the points off the stem: smaller pieces are stubs of other leaves
 TAPE_DEGREE, TAPE_ROUNDS, TAPE_NODES = 4, 4, 100
-STRAY = 3  # so many points may lie beyond the tip
 BLADE_REACH_CM = 7.0  # from the midrib: points further out are not of its section
 WITHIN = (1, 99)  # percentiles between which an extent is taken
 
@@ -102,8 +101,7 @@ def tape_along(leaf: np.ndarray, radius: float, degree: int = TAPE_DEGREE) -> np
         line = legendre.legval(np.linspace(-1.0, 1.0, TAPE_NODES), curve).T
         way = along(few, line)
     length = length_of(line)
-    tip = np.sort(along(leaf, line))[-1 - STRAY]
-    at = np.linspace(-STEM_REACH_CM, tip, 20 * TAPE_NODES)
+    at = np.linspace(-STEM_REACH_CM, along(leaf, line).max(), 20 * TAPE_NODES)
     out = np.maximum(at - length, 0.0)[:, np.newaxis] * direction(line[-2], line[-1])
     back = np.minimum(at, 0.0)[:, np.newaxis] * direction(line[0], line[1])
     line = points_at(line, at) + out + back
@@ -148,6 +146,15 @@ def extent(points: np.ndarray) -> float:
     middle = points - points.mean(axis=0)
     longest = np.linalg.svd(middle, full_matrices=False)[2][0]
     return float(np.diff(np.percentile(middle @ longest, WITHIN))[0])
+
+
+def expected_beyond(leaf: np.ndarray, blade: phytofit.Organ) -> float:
+    """Points that an even spread puts on the blade beyond the last of the leaf's points: about one, if it fits."""
+    node_at = np.concatenate([[0.0], np.cumsum(blade.segment_lengths)])
+    last = min(along(leaf, blade.axis).max(), node_at[-1])
+    at = np.append(last, node_at[node_at > last])
+    beyond = 2.0 * np.trapezoid(np.interp(at, node_at, blade.half_width), at)
+    return float(len(leaf) * beyond / blade.area)
 
 
 def sections_of(leaf: np.ndarray, blade: phytofit.Organ, start: float) -> list[Section]:

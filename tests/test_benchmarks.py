@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import phytofit
+from phytofit.models import move
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SAME = 1e-9  # cm; the same sums in the same order
@@ -147,6 +148,20 @@ def test_a_tape_follows_an_arc_from_the_stem(gap):
     assert tool.length_of(tape) == pytest.approx(40.0, abs=0.5)
     chord = np.rad2deg(np.deg2rad(40.0) + 8.0 / 40.0)  # over 8 cm, an arc's chord makes half its turn with the tangent
     assert tool.angle_over(tape, np.array([0.0, 0.0, 1.0]), 8.0) == pytest.approx(chord, abs=2.0)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_tape_measures_simulated_leaves(seed):
+    """Their tips are pointed, so the last point lies some tenths of a centimetre before the tip."""
+    tool, made = load("tape_measure"), phytofit.simulate(noise_cm=0.2, seed=seed)
+    true = {trait.name: trait.value for trait in phytofit.measure(made.organs)}
+    upright = np.linalg.inv(made.pose)
+    radius = 0.5 * true["stem_diameter"]
+    leaf = tool.leaf_of(made.points @ upright[:3, :3].T + upright[:3, 3], radius)
+    tape = tool.tape_along(leaf, radius)
+    assert -1.2 < tool.length_of(tape) - true["leaf_length"] < 0.5
+    assert tool.angle_over(tape, np.array([0.0, 0.0, 1.0]), 8.0) == pytest.approx(true["leaf_angle"], abs=1.0)
+    assert tool.expected_beyond(leaf, move(made.organs, upright)[1]) < 5.0
 
 
 def test_the_extent_of_a_section_is_that_across_it():
