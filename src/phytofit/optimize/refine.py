@@ -10,7 +10,8 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 __all__ = ["Refined", "refine"]
 
 FloatArray = NDArray[np.float64]
-LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e6  # times the information: steps are as good as full, or as none
+NO_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-6, 1e-4, 1e6  # times the information: steps are full, nearly, or none
+MORE, LESS = 10.0, 0.2  # times the damping, after a step that does not lower the error, and after one that does
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,6 @@ class Refined:
 
 def refine(
     evaluate: Callable[[FloatArray], tuple[float, FloatArray, FloatArray]],
-    error_of: Callable[[FloatArray], float],
     theta: FloatArray,
     *,
     lower: FloatArray,
@@ -39,7 +39,6 @@ def refine(
     Parameters
     ----------
     evaluate : theta (k,) -> error, gradient (k,), information (k, k), positive semi-definite
-    error_of : theta (k,) -> error alone
     tolerance : of the error, which the next step is expected to lower by less
     kink : where no step lowers an error that was expected to fall by less than this, it has a kink, and that is its
         minimum
@@ -54,13 +53,13 @@ def refine(
         hoped = None  # by how much the error is expected to fall in a step that is not damped
         while True:
             damped = (information + missing)[np.ix_(free, free)] + np.diag(
-                (damping if hoped is not None else LEAST_DAMPING) * diagonal + 1e-9
+                (damping if hoped is not None else NO_DAMPING) * diagonal + 1e-9
             )
             try:
                 factor = cho_factor(damped)
             except LinAlgError:
                 missing[:] = 0.0
-                damping *= 5.0
+                damping *= MORE
                 continue
             step = np.zeros_like(theta)
             step[free] = -cho_solve(factor, gradient[free])
@@ -68,20 +67,19 @@ def refine(
                 hoped = -0.5 * float(gradient @ step)
                 if hoped < tolerance:
                     return Refined(theta, error, iteration, True)
-                if damping > LEAST_DAMPING:
-                    continue
+                continue
             if damping > MOST_DAMPING:
                 return Refined(theta, error, iteration, hoped < kink)
             tried = np.clip(theta + step, lower, upper)
-            now = error_of(tried)
-            if now < error:
-                damping = max(0.2 * damping, LEAST_DAMPING)
+            now = evaluate(tried)
+            if now[0] < error:
+                damping = max(LESS * damping, LEAST_DAMPING)
                 break
-            damping *= 5.0
+            damping *= MORE
         moved = tried - theta
         before = gradient
         theta = tried
-        error, gradient, information = evaluate(theta)
+        error, gradient, information = now
         missing = _update(information + missing, moved, gradient - before) - information
     return Refined(theta, error, max_iterations, False)
 
