@@ -1,11 +1,11 @@
-"""Nearest pieces of a polyline and sums over pairs of points, against brute force in NumPy."""
+"""Points along a line, nearest pieces of a polyline and sums over pairs of points, against brute force in NumPy."""
 
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from phytofit.kernels.neighbors import nearest_pieces, sum_by_distance
+from phytofit.kernels.neighbors import near_line, nearest_pieces, sum_by_distance
 from phytofit.models import LEAF, Organ
 from phytofit.models.organs import frames_along
 
@@ -54,3 +54,15 @@ def test_sums_by_distance_are_those_of_all_pairs(n, every):
         those = others & (gap >= 0.5 * k) & (gap < 0.5 * (k + 1))
         assert count[k] == those.sum()
         assert total[k] == pytest.approx(np.sum((errors[probed, np.newaxis] * errors)[those]), rel=SAME, abs=SAME)
+
+
+@pytest.mark.parametrize("axis", [np.array([0.6, 0.0, 0.8]), np.zeros(3)])
+def test_what_is_near_a_line(axis):
+    random = np.random.default_rng(6)
+    points, center = 50.0 + random.normal(0.0, 2.0, (300, 3)), np.array([50.0, 51.0, 49.0])
+    along = (points - center) @ axis
+    gap = np.linalg.norm(points - center - along[:, np.newaxis] * axis, axis=1)
+    found = near_line(points, center, axis, 2.0, 1.5)
+    np.testing.assert_array_equal(found, np.flatnonzero((gap < 2.0) & (np.abs(along) < 1.5)))
+    assert 0 < len(found) < 300
+    assert len(near_line(points[:0], center, axis, 2.0, 1.5)) == 0

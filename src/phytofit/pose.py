@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phytofit.errors import NoPhytomerError
+from phytofit.kernels.neighbors import near_line
 
 __all__ = ["StartPose", "start_poses"]
 
 FloatArray = NDArray[np.float64]
 N_POINTS = 2000  # of the cloud, evenly by index: enough to see a stem by
 N_SEEDS = 160
+LEAST_NEAR = 10  # points along a line
 N_LINES = 2  # different lines that are handed on
 LEAST_SCORE = 0.3  # cm; a sphere or a wall gets 0.2 by chance, a phytomer with little left of its stem 0.4
 LEAST_SHARE = 0.6  # of the best line's score: a line that looks less like a stem is not handed on
@@ -75,10 +77,9 @@ def start_poses(points: FloatArray, stem_radius: float, *, up: FloatArray | None
 
 def _sections(points: FloatArray, center: FloatArray, axis: FloatArray, radius: float) -> tuple[FloatArray, ...]:
     """Sections of the points around a line, each half a radius high: height, count, roundness, offset, spread."""
-    along = (points - center) @ axis
-    across = points - center - along[:, np.newaxis] * axis
-    near = np.einsum("ij,ij->i", across, across) < radius**2
-    along, across = along[near], across[near]
+    offset = points[near_line(points, center, axis, radius, np.inf)] - center
+    along = offset @ axis
+    across = offset - along[:, np.newaxis] * axis
     step = 0.5 * radius
     if len(along) < 6:
         empty = np.zeros(0)
@@ -92,8 +93,8 @@ def _sections(points: FloatArray, center: FloatArray, axis: FloatArray, radius: 
     centered = across - mean[section]
     cov = np.empty((n, 3, 3))
     for a in range(3):
-        for b in range(3):
-            cov[:, a, b] = np.bincount(section, centered[:, a] * centered[:, b], n) / safe
+        for b in range(a + 1):
+            cov[:, a, b] = cov[:, b, a] = np.bincount(section, centered[:, a] * centered[:, b], n) / safe
     values = np.linalg.eigvalsh(cov)  # the first is 0: along the line
     roundness = np.sqrt(np.maximum(values[:, 1], 0.0) / np.maximum(values[:, 2], 1e-12))
     height = (first + np.arange(n) + 0.5) * step
@@ -118,25 +119,21 @@ def _stem_score(points: FloatArray, center: FloatArray, axis: FloatArray, radius
 def _lines(points: FloatArray, radius: float) -> list[tuple[FloatArray, FloatArray]]:
     """The few most stem-like lines: points on them and unit directions."""
     seeds = points[np.linspace(0, len(points) - 1, min(len(points), N_SEEDS)).astype(int)]
-    lines = []
-    for seed in seeds:
-        center, axis = seed, None
-        for reach in (2.0 * radius, 2.5 * radius, 4.0 * radius, 6.0 * radius, 6.0 * radius):
-            offset = points - center
-            if axis is None:
-                near = np.einsum("ij,ij->i", offset, offset) < reach**2
-            else:
-                along = offset @ axis
-                across2 = np.einsum("ij,ij->i", offset, offset) - along**2
-                near = (across2 < radius**2) & (np.abs(along) < reach)
-            if near.sum() < 10:
-                break
-            center = points[near].mean(axis=0)
-            deviation = points[near] - center
-            axis = np.linalg.eigh(deviation.T @ deviation)[1][:, 2]
-        else:
-            assert axis is not None
-            lines.append((_stem_score(points, center, axis, radius), center, axis))
+    centers, axes = seeds.copy(), np.zeros_like(seeds)  # of no direction yet
+    followed = list(range(len(seeds)))
+    for width, reach in ((2.0, 2.0), (1.0, 2.5), (1.0, 4.0), (1.0, 6.0), (1.0, 6.0)):
+        near = {i: near_line(points, centers[i], axes[i], width * radius, reach * radius) for i in followed}
+        followed = [i for i in followed if len(near[i]) >= LEAST_NEAR]
+        if not followed:
+            return []
+        moments = np.empty((len(followed), 3, 3))
+        for moment, i in zip(moments, followed, strict=True):
+            chosen = points[near[i]]
+            centers[i] = chosen.mean(axis=0)
+            deviation = chosen - centers[i]
+            moment[:] = deviation.T @ deviation
+        axes[followed] = np.linalg.eigh(moments)[1][:, :, 2]
+    lines = [(_stem_score(points, centers[i], axes[i], radius), centers[i], axes[i]) for i in followed]
     lines.sort(key=lambda line: -line[0])
     kept: list[tuple[FloatArray, FloatArray]] = []
     for score, center, axis in lines:

@@ -1,10 +1,25 @@
-"""What lies near a point: the nearest piece of a polyline, and the products of its neighbours' errors with its own."""
+"""What is near: the points along a line, a point's nearest piece of a polyline, its neighbours' errors."""
 
 import numpy as np
 
 from phytofit.kernels.compiling import kernel
 
-__all__ = ["nearest_pieces", "sum_by_distance"]
+__all__ = ["near_line", "nearest_pieces", "sum_by_distance"]
+
+
+@kernel
+def near_line(points, center, axis, width, reach):
+    """Numbers (k,) of the points (n, 3) that are nearer than `width` to the line through `center` (3,) along `axis`
+    (3,), and along it nearer than `reach` to the center; nearer than `width` to the center, if the axis is zero."""
+    found = np.empty(len(points), np.intp)
+    n = 0
+    for i in range(len(points)):
+        x, y, z = points[i, 0] - center[0], points[i, 1] - center[1], points[i, 2] - center[2]
+        along = x * axis[0] + y * axis[1] + z * axis[2]
+        if x * x + y * y + z * z - along * along < width * width and abs(along) < reach:
+            found[n] = i
+            n += 1
+    return found[:n]
 
 
 @kernel
