@@ -14,7 +14,7 @@ from scipy.special import stdtrit
 
 from phytofit.beginnings import along_points, lower_insertion, turned_blade
 from phytofit.dependence import Dependence, score_dependence, width_misfit
-from phytofit.distances import Reference, quantile_hausdorff
+from phytofit.distances import Reference, chamfer
 from phytofit.flags import Sighting, density_over, sighting
 from phytofit.likelihood import THICKNESS, CloudLikelihood, Evaluation, State
 from phytofit.objectives import PaperObjective, minimise
@@ -85,7 +85,7 @@ def estimate(
     *,
     organ: NDArray[np.int8] | None = None,
     n_samples: int = 60,
-    n_points: int = 300,
+    n_points: int = 200,
     n_generations: int = 4,
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
@@ -119,7 +119,7 @@ def estimate(
         Reference.of(points[::stride], None),
         starts=[_at_junction(mean, pose) for mean, pose in starts],
         n_points=n_points,
-        distance=quantile_hausdorff,
+        distance=chamfer,
         scout_stride=4,
         tilts_deg=(),
         seed=seed,

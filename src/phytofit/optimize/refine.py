@@ -30,7 +30,7 @@ def refine(
     *,
     lower: FloatArray,
     upper: FloatArray,
-    max_iterations: int = 60,
+    max_iterations: int = 100,
     tolerance: float = 3e-3,
     kink: float = 0.1,
 ) -> Refined:
