@@ -25,6 +25,7 @@ __all__ = ["DITHER_CM", "Estimate", "estimate"]
 
 FloatArray = NDArray[np.float64]
 COARSE_POINTS = 700  # that decide which start is the best
+N_EXPLORED = 1200  # that decide which beginning of a richer leaf is
 SCOUT_ITERATIONS, COARSE_ITERATIONS = 5, 25  # of all starts; then of those that may be the best
 HOPELESS = 0.3  # nats for each point, by which a start is behind after the first
 COARSE_TOLERANCE = 1.0  # nats; it is refined with all points afterwards
@@ -34,6 +35,7 @@ DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its twelve parameters gain six by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
+CLEARLY_BETTER = 5.0  # nats of all points, by which another beginning of a richer leaf must fit better
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
 LOWER_ROUNDS = 3
@@ -140,6 +142,11 @@ class _Cloud(NamedTuple):
     organ: NDArray[np.int8] | None
     executor: Executor | None
 
+    def part(self, n: int) -> "_Cloud":
+        """Every so-many-th point, n or a little more."""
+        stride = max(1, len(self.points) // n)
+        return _Cloud(self.points[::stride], None if self.organ is None else self.organ[::stride], self.executor)
+
 
 class _End(NamedTuple):
     """Where a refinement ended, evaluated there."""
@@ -171,14 +178,10 @@ class _Chosen(NamedTuple):
 
 def _drawn_in(plain: Species, cloud: _Cloud, begun: Sequence[tuple[FloatArray, FloatArray]]) -> State:
     """The best of what the beginnings (parameters and pose) lead to, with a part of the points and wide noise."""
-    stride = max(1, len(cloud.points) // COARSE_POINTS)
-    points = cloud.points[::stride]
+    part = cloud.part(COARSE_POINTS)
+    weight = len(cloud.points) // len(part.points)
     coarse = CloudLikelihood(
-        plain.model,
-        plain.space,
-        points,
-        organ=None if cloud.organ is None else cloud.organ[::stride],
-        weights=np.full(len(points), float(stride)),
+        plain.model, plain.space, part.points, organ=part.organ, weights=np.full(len(part.points), float(weight))
     )
     noise_cm = START_NOISE * float(plain.space.mean[plain.space.index("leaf_length")])
     states = [coarse.start(mean, pose, noise_cm) for mean, pose in begun]
@@ -205,25 +208,40 @@ def _candidates(plain: Species, species: Species, cloud: _Cloud, state: State) -
         return found
     simple = found[1] if found[1].fit_of_points - found[0].fit_of_points > TIP_MISSING else found[0]
     if _promise(species, simple, cloud) > SHAPE_PROMISE:
-        begun = [found[0].state, *turned_blade(species, found[0].likelihood, found[0].state, found[0].at.scores)]
-        best = max((_end(species, it, cloud, thick=True) for it in begun), key=lambda end: end.fit_of_points)
-        best = _better(species, cloud, best, along_points(species, best.likelihood, best.state, best.at.scores))
-        for _ in range(LOWER_ROUNDS):
-            lower = _better(species, cloud, best, lower_insertion(species, best.state))
-            if lower is best:
-                break
-            best = lower
-        found.append(best)
-        cut = [_end(species, _cut(best.state, share), cloud, thick=True, cut=True) for share in CUT_SHARES]
-        found.append(max(cut, key=lambda end: end.fit_of_points))
+        found += _rich(species, cloud, found[0])
     return found
 
 
-def _better(species: Species, cloud: _Cloud, best: _End, begun: Iterable[State]) -> _End:
-    """Of the best so far and what other beginnings lead to, that which clearly fits better."""
+def _rich(species: Species, cloud: _Cloud, simple: _End) -> tuple[_End, _End]:
+    """With all parameters of the species, whole and with the tip missing: where the best of several beginnings leads
+    to, which is found with a part of the points."""
+    part = cloud.part(N_EXPLORED)
+    begun = [simple.state, *turned_blade(species, simple.likelihood, simple.state, simple.at.scores)]
+    best = max((_end(species, it, part, thick=True) for it in begun), key=lambda end: end.fit_of_points)
+    best = _elsewhere(species, part, best, CLEARLY_BETTER * len(part.points) / len(cloud.points), LOWER_ROUNDS)
+    best = _elsewhere(species, cloud, _end(species, best.state, cloud, thick=True), CLEARLY_BETTER, 1)
+    begun = [_cut(best.state, share) for share in CUT_SHARES]
+    cut = max((_end(species, it, part, thick=True, cut=True) for it in begun), key=lambda end: end.fit_of_points)
+    return best, _end(species, cut.state, cloud, thick=True, cut=True)
+
+
+def _elsewhere(species: Species, cloud: _Cloud, best: _End, clear: float, rounds: int) -> _End:
+    """The best so far, or where a midrib along the points, or an insertion lower down, leads to, if that fits better by
+    a clear number of nats."""
+    best = _better(species, cloud, best, along_points(species, best.likelihood, best.state, best.at.scores), clear)
+    for _ in range(rounds):
+        lower = _better(species, cloud, best, lower_insertion(species, best.state), clear)
+        if lower is best:
+            break
+        best = lower
+    return best
+
+
+def _better(species: Species, cloud: _Cloud, best: _End, begun: Iterable[State], clear: float) -> _End:
+    """Of the best so far and what other beginnings lead to, that which fits better by a clear number of nats."""
     for state in begun:
         end = _end(species, state, cloud, thick=True)
-        if end.fit_of_points > best.fit_of_points + TIP_MISSING:
+        if end.fit_of_points > best.fit_of_points + clear:
             best = end
     return best
 
