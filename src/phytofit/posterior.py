@@ -179,7 +179,7 @@ class _Chosen(NamedTuple):
 def _drawn_in(plain: Species, cloud: _Cloud, begun: Sequence[tuple[FloatArray, FloatArray]]) -> State:
     """The best of what the beginnings (parameters and pose) lead to, with a part of the points and wide noise."""
     part = cloud.part(COARSE_POINTS)
-    weight = len(cloud.points) // len(part.points)
+    weight = round(len(cloud.points) / len(part.points))
     coarse = CloudLikelihood(
         plain.model, plain.space, part.points, organ=part.organ, weights=np.full(len(part.points), float(weight))
     )
