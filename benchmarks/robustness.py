@@ -291,7 +291,7 @@ def field(pool: ProcessPoolExecutor) -> None:
         print(
             f"  {how:7} {COPIES} copies, {kept.sum()} with the tip: within 1 cm {np.sum(off[kept] <= 1.0)}, "
             f"median {np.median(off[kept]):.2f} cm off, at most {off[kept].max():.2f}; "
-            f"interval holds it for {100 * held:.0f} % of all; tip said to be missing or doubtful in {missing.sum():.0f}"
+            f"interval holds it for {100 * held:.0f} % of all; tip missing or doubtful: {missing.sum():.0f}"
         )
 
 

@@ -25,7 +25,7 @@ __all__ = ["DITHER_CM", "Estimate", "estimate"]
 
 FloatArray = NDArray[np.float64]
 COARSE_POINTS = 700  # that decide which start is the best
-N_EXPLORED = 1200  # that decide which beginning of a richer leaf is
+FEW_POINTS = 1250  # with which a refinement begins, and which decide from where a richer leaf is begun
 SCOUT_ITERATIONS, COARSE_ITERATIONS = 5, 25  # of all starts; then of those that may be the best
 HOPELESS = 0.3  # nats for each point, by which a start is behind after the first
 COARSE_TOLERANCE = 1.0  # nats; it is refined with all points afterwards
@@ -35,7 +35,7 @@ DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its twelve parameters gain six by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
-CLEARLY_BETTER = 5.0  # nats of all points, by which another beginning of a richer leaf must fit better
+CLEARLY_BETTER = 5.0  # nats, by which another beginning of a richer leaf must fit better
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
 LOWER_ROUNDS = 3
@@ -136,16 +136,30 @@ def estimate(
 
 
 class _Cloud(NamedTuple):
-    """Points (n, 3), what their labels say (n,) or None, and who works on them."""
+    """Points (n, 3), what their labels say (n,) or None, who works on them, and for how many each of them stands."""
 
     points: FloatArray
     organ: NDArray[np.int8] | None
     executor: Executor | None
+    stride: int = 1
 
     def part(self, n: int) -> "_Cloud":
-        """Every so-many-th point, n or a little more."""
+        """Every so-many-th point, n or a little more, with the weight of those that it stands for."""
         stride = max(1, len(self.points) // n)
-        return _Cloud(self.points[::stride], None if self.organ is None else self.organ[::stride], self.executor)
+        organ = None if self.organ is None else self.organ[::stride]
+        return _Cloud(self.points[::stride], organ, self.executor, self.stride * stride)
+
+    def likelihood(self, species: Species, **settings: Any) -> CloudLikelihood:
+        weights = None if self.stride == 1 else np.full(len(self.points), float(self.stride))
+        return CloudLikelihood(
+            species.model,
+            species.space,
+            self.points,
+            organ=self.organ,
+            weights=weights,
+            executor=self.executor,
+            **settings,
+        )
 
 
 class _End(NamedTuple):
@@ -158,8 +172,9 @@ class _End(NamedTuple):
 
     @property
     def fit_of_points(self) -> float:
-        """Log probability of the points."""
-        return float(self.at.log_p.sum())
+        """Log probability of the points, each counted for those that it stands for."""
+        weights = self.likelihood.weights
+        return float(self.at.log_p.sum() if weights is None else weights @ self.at.log_p)
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -178,11 +193,7 @@ class _Chosen(NamedTuple):
 
 def _drawn_in(plain: Species, cloud: _Cloud, begun: Sequence[tuple[FloatArray, FloatArray]]) -> State:
     """The best of what the beginnings (parameters and pose) lead to, with a part of the points and wide noise."""
-    part = cloud.part(COARSE_POINTS)
-    weight = round(len(cloud.points) / len(part.points))
-    coarse = CloudLikelihood(
-        plain.model, plain.space, part.points, organ=part.organ, weights=np.full(len(part.points), float(weight))
-    )
+    coarse = cloud._replace(executor=None).part(COARSE_POINTS).likelihood(plain)  # one thread a start
     noise_cm = START_NOISE * float(plain.space.mean[plain.space.index("leaf_length")])
     states = [coarse.start(mean, pose, noise_cm) for mean, pose in begun]
     run = map if cloud.executor is None else cloud.executor.map
@@ -215,33 +226,32 @@ def _candidates(plain: Species, species: Species, cloud: _Cloud, state: State) -
 def _rich(species: Species, cloud: _Cloud, simple: _End) -> tuple[_End, _End]:
     """With all parameters of the species, whole and with the tip missing: where the best of several beginnings leads
     to, which is found with a part of the points."""
-    part = cloud.part(N_EXPLORED)
+    part = cloud.part(FEW_POINTS)
     begun = [simple.state, *turned_blade(species, simple.likelihood, simple.state, simple.at.scores)]
     best = max((_end(species, it, part, thick=True) for it in begun), key=lambda end: end.fit_of_points)
-    best = _elsewhere(species, part, best, CLEARLY_BETTER * len(part.points) / len(cloud.points), LOWER_ROUNDS)
-    best = _elsewhere(species, cloud, _end(species, best.state, cloud, thick=True), CLEARLY_BETTER, 1)
+    best = _elsewhere(species, part, best, LOWER_ROUNDS)
+    best = _elsewhere(species, cloud, _end(species, best.state, cloud, thick=True), 1)
     begun = [_cut(best.state, share) for share in CUT_SHARES]
     cut = max((_end(species, it, part, thick=True, cut=True) for it in begun), key=lambda end: end.fit_of_points)
     return best, _end(species, cut.state, cloud, thick=True, cut=True)
 
 
-def _elsewhere(species: Species, cloud: _Cloud, best: _End, clear: float, rounds: int) -> _End:
-    """The best so far, or where a midrib along the points, or an insertion lower down, leads to, if that fits better by
-    a clear number of nats."""
-    best = _better(species, cloud, best, along_points(species, best.likelihood, best.state, best.at.scores), clear)
+def _elsewhere(species: Species, cloud: _Cloud, best: _End, rounds: int) -> _End:
+    """The best so far, or where a midrib along the points, or an insertion lower down, leads to, if it fits better."""
+    best = _better(species, cloud, best, along_points(species, best.likelihood, best.state, best.at.scores))
     for _ in range(rounds):
-        lower = _better(species, cloud, best, lower_insertion(species, best.state), clear)
+        lower = _better(species, cloud, best, lower_insertion(species, best.state))
         if lower is best:
             break
         best = lower
     return best
 
 
-def _better(species: Species, cloud: _Cloud, best: _End, begun: Iterable[State], clear: float) -> _End:
-    """Of the best so far and what other beginnings lead to, that which fits better by a clear number of nats."""
+def _better(species: Species, cloud: _Cloud, best: _End, begun: Iterable[State]) -> _End:
+    """Of the best so far and what other beginnings lead to, that which clearly fits better."""
     for state in begun:
         end = _end(species, state, cloud, thick=True)
-        if end.fit_of_points > best.fit_of_points + clear:
+        if end.fit_of_points > best.fit_of_points + CLEARLY_BETTER:
             best = end
     return best
 
@@ -263,18 +273,12 @@ def _choice(found: Sequence[_End]) -> _Chosen:
 
 def _end(species: Species, state: State, cloud: _Cloud, *, thick: bool = False, cut: bool = False) -> _End:
     density = None
-    for _ in range(HOLE_ROUNDS):
-        likelihood = CloudLikelihood(
-            species.model,
-            species.space,
-            cloud.points,
-            organ=cloud.organ,
-            thick=thick,
-            cut=cut,
-            density=density,
-            executor=cloud.executor,
-        )
+    for number in range(HOLE_ROUNDS):
+        likelihood = cloud.likelihood(species, thick=thick, cut=cut, density=density)
         state = likelihood.extended(state)
+        if number == 0 and len(cloud.points) >= 2 * FEW_POINTS:
+            few = cloud.part(FEW_POINTS).likelihood(species, thick=thick, cut=cut)
+            state = likelihood.with_theta(state, _refined(few, state, tolerance=COARSE_TOLERANCE).theta)
         end = _refined(likelihood, state)
         state = State(end.theta, state.pose, state.center)
         at = likelihood.evaluate(state)
@@ -300,9 +304,7 @@ def _dithered(points: FloatArray, seed: int) -> FloatArray:
 
 def _promise(species: Species, end: _End, cloud: _Cloud) -> float:
     """Log probability that a richer leaf is expected to gain over the fitted one, by Rao's score test."""
-    likelihood = CloudLikelihood(
-        species.model, species.space, cloud.points, organ=cloud.organ, cut=True, executor=cloud.executor
-    )
+    likelihood = cloud.likelihood(species, cut=True)
     state = likelihood.extended(end.state)
     state.theta[THICKNESS] = end.state.theta[THICKNESS]
     _, gradient, information = _terms(likelihood, state)
