@@ -1,6 +1,7 @@
 """A whole fit by the default method: what it recovers, how sure it says it is, and what it flags."""
 
 import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 import phytofit
 from phytofit import Status
+from phytofit.fitting import _beside_its_rival
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "sodhi2018"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data/sodhi2018 is absent")
@@ -278,3 +280,19 @@ def test_every_cloud_of_the_paper_in_three_orientations(path):
         turn = phytofit.simulation.random_pose(np.random.default_rng(seed))
         turned = dataclasses.replace(cloud, points=cloud.points @ turn[:3, :3].T + turn[:3, 3])
         assert values(phytofit.fit(turned))["leaf_length"] == pytest.approx(values(given)["leaf_length"], abs=2.0)
+
+
+def test_two_solutions_are_told(result):
+    """Where another model is about as probable, and its traits lie beyond the intervals; not where they lie within."""
+    assert result.estimate.rival is None
+    longer = result.x.copy()
+    longer[3] += 10.0
+
+    def beside(rival):
+        return _beside_its_rival(replace(result, estimate=replace(result.estimate, rival=rival))).flags
+
+    (flag,) = beside(longer)
+    assert flag.startswith("two solutions are about as probable: leaf_length may be ")
+    assert float(flag.split()[9]) == pytest.approx(values(result)["leaf_length"] + 10.0, abs=0.5)
+    assert "stem_diameter" not in flag
+    assert beside(result.x) == beside(None) == ()

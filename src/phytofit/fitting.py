@@ -37,6 +37,7 @@ DITHERED = f"the points had no noise: {DITHER_CM:g} cm was added, without which 
 INTERVAL_METHOD = "sandwich interval"
 OPEN_WITHOUT_TIP = ("leaf_length", "leaf_area")  # no upper end where the tip was not seen
 PLAUSIBLE_LEAD = 4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
+TOLD_OF_RIVALS = ("stem_diameter", "leaf_length", "leaf_angle", "leaf_width")
 UP_DOUBTFUL = "the leaf leaves the stem downwards or bends up: is the stated up right?"
 UP_UNKNOWN = "up and down can't be told apart by this leaf: the more plausible is given; state up if it is known"
 
@@ -281,7 +282,7 @@ def fit(
             "seed_point": None if seed_points is None else seed_points.tolist(),
         },
     )
-    return _remarked(_right_way_up(result, direction))
+    return _remarked(_right_way_up(_beside_its_rival(result), direction))
 
 
 def fit_paper(
@@ -417,6 +418,21 @@ def _remarked(result: Fit) -> Fit:
         scale=result.scale,
     )
     return replace(result, flags=(*result.flags, *flags))
+
+
+def _beside_its_rival(result: Fit) -> Fit:
+    """The result, with a flag if another model is about as probable and its traits lie beyond the intervals."""
+    if result.estimate is None or result.estimate.rival is None:
+        return result
+    other = dict(zip([t.name for t in result.traits], result._values(result.estimate.rival), strict=True))
+    differ = [
+        f"{t.name} may be {other[t.name]:.3g} {t.unit}"
+        for t in result.traits
+        if t.name in TOLD_OF_RIVALS and not (t.low or 0.0) <= other[t.name] <= (np.inf if t.high is None else t.high)
+    ]
+    if not differ:
+        return result
+    return replace(result, flags=(*result.flags, f"two solutions are about as probable: {', '.join(differ)}"))
 
 
 def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:

@@ -36,6 +36,7 @@ N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its twelve parameters gain six by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 CLEARLY_BETTER = 5.0  # nats, by which another beginning of a richer leaf must fit better
+ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
 LOWER_ROUNDS = 3
@@ -55,6 +56,7 @@ class Estimate:
     independent points would; ``misfit_cm``: how far the blade's surface lies off the model's, as the errors that
     neighbours share say; ``width_misfit``: by what share its width is off the model's, place by place;
     ``correlated_cm``: how far errors of neighbours are correlated, 0 if they are not;
+    ``rival`` (m,): parameters of the other model, if it is about as probable;
     ``quantile``: standard errors to either side of a 95 % interval, Student's; ``sighting``: what of the phytomer the
     cloud shows; ``dithered``: whether noise was added to the points, which had none.
     """
@@ -73,6 +75,7 @@ class Estimate:
     misfit_cm: float
     width_misfit: float
     correlated_cm: float
+    rival: FloatArray | None
     quantile: float
     converged: bool
     history: tuple[Generation, ...]
@@ -189,6 +192,7 @@ class _Chosen(NamedTuple):
     evidence: float
     dependence: Dependence
     tip_doubtful: bool
+    rival: FloatArray | None
 
 
 def _drawn_in(plain: Species, cloud: _Cloud, begun: Sequence[tuple[FloatArray, FloatArray]]) -> State:
@@ -268,7 +272,9 @@ def _choice(found: Sequence[_End]) -> _Chosen:
     best = int(np.argmax(backed))
     if best < len(found) - 1:
         dependence = score_dependence(found[best].likelihood, found[best].state, dependence)
-    return _Chosen(found[best], evidence[best], dependence, best % 2 == 0 and gains[best] > TIP_DOUBTFUL)
+    others = [i for i in range(len(found)) if i // 2 != best // 2 and backed[i] > backed[best] - ABOUT_AS_PROBABLE]
+    rival = found[max(others, key=lambda i: backed[i])].state.x if others else None
+    return _Chosen(found[best], evidence[best], dependence, best % 2 == 0 and gains[best] > TIP_DOUBTFUL, rival)
 
 
 def _end(species: Species, state: State, cloud: _Cloud, *, thick: bool = False, cut: bool = False) -> _End:
@@ -387,6 +393,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         misfit_cm=float(np.sqrt(dependence.correlation) * np.hypot(*state.noise[1:])),
         width_misfit=width_misfit(likelihood, state, at.scores),
         correlated_cm=dependence.reach_cm,
+        rival=chosen.rival,
         quantile=float(stdtrit(left, 0.975)),
         converged=end.converged,
         history=history,
