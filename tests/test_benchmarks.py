@@ -7,13 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import integrate, stats
 from scipy.spatial import cKDTree
 
 import phytofit
 from phytofit.models import move
+from phytofit.likelihood import Evaluation, State
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SAME = 1e-9  # cm; the same sums in the same order
+LAPLACE = 0.02  # nats; exact but at a bound, where the scores' outer product is not quite the curvature
 AT_REST = 1e-6  # cm; the source is a part of the reference
 
 
@@ -183,6 +186,88 @@ def test_maize_leaves_lie_along_their_true_organs():
         rho = np.hypot(leaf.points[:, 0], leaf.points[:, 1])
         assert np.all((near < blade.half_width.max() + 2.0) | (rho < stem.half_width.max() + 1.5)), leaf.name
         assert 10.0 < blade.segment_lengths.sum() < 130.0
+
+
+class Bounded:
+    """Numbers of a normal distribution, mean unknown within bounds, as a likelihood that has nothing else."""
+
+    def __init__(self, values, mean, std, lower, upper):
+        self.values, self.weights = values, np.ones(len(values))
+        self.mean, self.precision = np.array([mean]), np.array([std**-2.0])
+        self.lower, self.upper = np.array([lower]), np.array([upper])
+
+    def evaluate(self, state):
+        off = self.values - state.theta
+        log_p = -0.5 * off**2 - 0.5 * np.log(2.0 * np.pi)
+        error = 0.5 * float(np.sum((state.theta - self.mean) ** 2 * self.precision)) - log_p.sum()
+        return Evaluation(error, off[:, np.newaxis], log_p)
+
+
+@pytest.mark.parametrize(("lower", "upper"), [(-50.0, 50.0), (0.9, 9.0), (-9.0, 1.3), (1.05, 30.0)])
+def test_evidence_is_the_integral_over_what_lies_within_the_bounds(lower, upper):
+    evidence = load("evidence")
+    values = 1.0 + np.array([-1.0, 1.0] * 8)  # of variance 1: the scores' outer product is the curvature
+    mean, std = 2.0, 3.0
+    likelihood = Bounded(values, min(mean, upper), std, lower, upper)
+    prior = stats.truncnorm(
+        (lower - likelihood.mean[0]) / std, (upper - likelihood.mean[0]) / std, likelihood.mean, std
+    )
+
+    def density(x):
+        return float(np.exp(np.sum(stats.norm.logpdf(values, x)) + 30.0) * prior.pdf(x)[0])
+
+    integral = integrate.quad(density, max(lower, -3.0), min(upper, 5.0), epsabs=0.0)[0]
+    best = np.clip([(values.sum() + likelihood.mean[0] / 9.0) / (len(values) + 1.0 / 9.0)], lower, upper)
+    state = State(best, np.eye(4), np.zeros(3))
+    assert evidence.log_evidence(likelihood, state) == pytest.approx(np.log(integral) - 30.0, abs=LAPLACE)
+
+
+def test_a_leaf_is_cut_with_its_piece_of_stem_and_scaled():
+    """A plant in mm whose stem goes on for 30 cm, and a second leaf: the piece has its place, its axis and its size."""
+    cut_leaves = load("cut_leaves")
+    lengths = {"stem_length": 30.0, "stem_length_above": 30.0, "leaf_length": 40.0}
+    made = phytofit.simulate(fixed=lengths, noise_cm=0.1, seed=1)
+    other = made.labels == 2
+    beside = made.points[other] @ np.diag([1.0, 1.0, 1.0]) + 60.0 * made.pose[:3, 2]
+    points = 10.0 * np.concatenate([made.points, beside])
+    plant = cut_leaves.Plant("", "", "", points, np.concatenate([made.labels, np.full(other.sum(), 3)]))
+    leaf = cut_leaves.cut_leaf(plant, 2, 100_000)
+    start = leaf.starts[0]
+    assert np.sum(leaf.organ == 1) == other.sum()
+    assert start.pose[:3, 2] @ made.pose[:3, 2] > np.cos(np.deg2rad(3.0))
+    assert start.pose[:3, 0] @ made.pose[:3, 0] > np.cos(np.deg2rad(10.0))
+    scale = cut_leaves.LEAF_CM / 40.0
+    assert start.radius == pytest.approx(0.5 * scale * made.x[0], rel=0.1)
+    assert start.top - start.foot == pytest.approx(25.0, abs=1.0)
+    nearest = cKDTree(leaf.points[leaf.organ == 1]).query(leaf.points[leaf.organ == 0])[0]
+    assert nearest.min() < 1.0
+    assert cut_leaves.midrib_length(leaf.points[leaf.organ == 1], 0) > 0.0
+    assert cut_leaves.cut_leaf(plant, 4, 1000) is None
+
+
+def test_evidence_tells_a_parameter_that_is_there_from_one_that_is_not(monkeypatch):
+    """Leaves that bend sideways, each by another angle, and have no wave: the one pays for itself on plants that were
+    left out, the other costs."""
+    evidence = load("evidence")
+    there, absent = "leaf_side_bend", "leaf_wave"
+    monkeypatch.setattr(evidence, "HELD", {"full": (), there: (there,), absent: (absent,)})
+    for name, grid in (("ANGLE", (45.0,)), ("BEND", (3.5,)), ("ROLL", (0.0,))):
+        monkeypatch.setattr(evidence, f"BEGUN_{name}", grid)
+    cut = []
+    for seed, bend in enumerate((-25.0, -10.0, 12.0, 24.0)):
+        made = phytofit.simulate(fixed={there: bend}, n_points=500, seed=seed)
+        start = phytofit.StartPose(made.pose @ moved_up(made.x[1]), -made.x[1], made.x[6], 1.5, 0.0, 0.0)
+        cut.append(evidence.Leaf("simulated", str(seed), "", made.points, (made.labels - 1).astype(np.int8), [start]))
+    fits, found = evidence.study(cut, map)
+    assert len(fits) == len(cut)
+    assert min(it[there][0] for it in found) > 2.0
+    assert np.mean([it[absent][0] for it in found]) < 0.0
+
+
+def moved_up(height):
+    pose = np.eye(4)
+    pose[2, 3] = height
+    return pose
 
 
 @pytest.mark.long
