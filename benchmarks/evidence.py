@@ -5,7 +5,7 @@
 A parameter earns its place if leaves of a plant that was left out are the more probable for it.  So, of all labelled
 leaves in ../shared/data (and the paper's clouds, which are one leaf each):
 
-1. A leaf is cut out with its piece of stem, and made as long as the species expects a leaf to be: only shape counts.
+1. A leaf is cut out with its piece of stem, and made as long as the species expects a leaf to be: its shape counts.
 2. The model with all parameters is fitted; and, from where that ended, the model with each parameter in turn held at
    its neutral value (as if there were no such parameter), and with all of them held.  These fits hardly look at the
    species file's prior: it is made three times as wide.
@@ -151,7 +151,7 @@ def log_evidence(likelihood: CloudLikelihood, state: State) -> float:
     return float(-at.error + 0.5 * gradient @ step + volume + inside.sum() - inside_before.sum())
 
 
-def begun(leaf: Leaf) -> list[State]:
+def beginnings(leaf: Leaf) -> list[State]:
     """Where to begin: what the default method finds, and the most probable, for the model with no and with all of the
     parameters, of what a grid of angles leads to, with a part of the points, much noise and few outliers."""
     feet = [start.pose.copy() for start in leaf.starts]
@@ -185,7 +185,7 @@ def fit_leaf(leaf: Leaf) -> Fitted:
     """The modes of all models under the wide prior, step 2."""
     fitted = Fitted(leaf, {}, None, 1.0)
     likelihood = likelihood_of(fitted, {}, WIDE)
-    state = min((refined(likelihood, state) for state in begun(leaf)), key=partial(error_at, likelihood))
+    state = best_end(likelihood, beginnings(leaf))
     for _ in range(HOLE_ROUNDS):
         fitted = fitted._replace(density=density_over(likelihood, state, likelihood.evaluate(state).scores))
         likelihood = likelihood_of(fitted, {}, WIDE)
@@ -205,16 +205,19 @@ def at_rest(models: dict[str, CloudLikelihood], begun: dict[str, list[State]]) -
     in it.  So the full model is begun again from any that is more probable, and then all the others from there.
     """
     full = models["full"]
+    others = [model for model in models if model != "full"]
     for _ in range(ROUNDS):
-        states: dict[str, State] = {}
-        for model, likelihood in models.items():  # the full one comes first
-            ends = [refined(likelihood, state) for state in (*begun[model], *list(states.values())[:1])]
-            states[model] = min(ends, key=partial(error_at, likelihood))
+        states = {"full": best_end(full, begun["full"])}
+        states |= {model: best_end(models[model], [*begun[model], states["full"]]) for model in others}
         best = min(states.values(), key=partial(error_at, full))
         if error_at(full, best) > error_at(full, states["full"]) - BETTER:
             break
         begun = {model: [state] for model, state in states.items()} | {"full": [best]}
     return states
+
+
+def best_end(likelihood: CloudLikelihood, begun: Sequence[State]) -> State:
+    return min((refined(likelihood, state) for state in begun), key=partial(error_at, likelihood))
 
 
 def error_at(likelihood: CloudLikelihood, state: State) -> float:
