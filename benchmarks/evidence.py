@@ -124,11 +124,7 @@ def refined(likelihood: CloudLikelihood, state: State, max_iterations: int = 60)
         gradient = (theta - likelihood.mean) * likelihood.precision - weighted.sum(axis=0)
         return at.error, gradient, at.scores.T @ weighted + np.diag(likelihood.precision)
 
-    def error_of(theta: np.ndarray) -> float:
-        return likelihood.evaluate(likelihood.with_theta(state, theta), derivatives=False).error
-
-    bounds = {"lower": likelihood.lower, "upper": likelihood.upper}
-    end = refine(evaluate, error_of, state.theta, **bounds, max_iterations=max_iterations)
+    end = refine(evaluate, state.theta, lower=likelihood.lower, upper=likelihood.upper, max_iterations=max_iterations)
     return likelihood.with_theta(state, end.theta)
 
 

@@ -11,8 +11,8 @@ from scipy import integrate, stats
 from scipy.spatial import cKDTree
 
 import phytofit
-from phytofit.models import move
 from phytofit.likelihood import Evaluation, State
+from phytofit.models import move
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SAME = 1e-9  # cm; the same sums in the same order
