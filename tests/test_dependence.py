@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from phytofit.dependence import _correlation, score_dependence
+from phytofit.dependence import NONE, _correlation, score_dependence
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import SurfaceSampler, move
 from phytofit.species import load_species
@@ -62,7 +62,7 @@ def in_standard_errors(likelihood, state, variability):
 def test_independent_errors_inflate_nothing(seed, k):
     likelihood, state = scene(seed, k=k)
     found = score_dependence(likelihood, state)
-    assert (found.inflation, found.reach_cm, found.correlation) == (1.0, 0.0, 0.0)
+    assert (found.inflation, found.stem, found.leaf) == (1.0, NONE, NONE)
     scores = likelihood.evaluate(state).scores
     np.testing.assert_allclose(found.variability, scores.T @ scores, rtol=SAME)
 
@@ -71,8 +71,8 @@ def test_independent_errors_inflate_nothing(seed, k):
 def test_errors_of_neighbours_are_found_to_be_correlated(seed, k):
     likelihood, state = scene(seed, n=800, k=k, width_cm=1.0, share=1.0)
     found = score_dependence(likelihood, state)
-    assert found.reach_cm == pytest.approx(np.sqrt(2.0), rel=REACH)
-    assert found.correlation == pytest.approx(1.0, abs=HEIGHT)
+    assert found.leaf.reach_cm == pytest.approx(np.sqrt(2.0), rel=REACH)
+    assert found.leaf.correlation == pytest.approx(1.0, abs=HEIGHT)
     assert found.inflation > 2.0
 
 
@@ -131,8 +131,8 @@ def test_a_cloud_may_lie_anywhere():
     moved = likelihood.at(likelihood.points @ there[:3, :3].T + there[:3, 3])
     turned = State(state.theta, there @ state.pose, there[:3, :3] @ state.center + there[:3, 3])
     here, away = score_dependence(likelihood, state), score_dependence(moved, turned)
-    assert away.reach_cm == here.reach_cm
-    assert away.correlation == pytest.approx(here.correlation, rel=1e-6)
+    assert away.leaf.reach_cm == here.leaf.reach_cm
+    assert away.leaf.correlation == pytest.approx(here.leaf.correlation, rel=1e-6)
     assert away.inflation == pytest.approx(here.inflation, rel=CELLS)
 
 
@@ -157,8 +157,25 @@ def test_misfit_counts_as_correlation():
     points += random.normal(0.0, NOISE_CM, points.shape)
     likelihood = CloudLikelihood(species.model, species.space, points)
     found = score_dependence(likelihood, likelihood.start(X[:7], np.eye(4), 2.0 * NOISE_CM))
-    assert found.reach_cm > 1.0
+    assert found.leaf.reach_cm > 1.0
     assert found.inflation > 2.0
+
+
+def test_stem_and_leaf_are_correlated_each_by_itself():
+    """Errors of the leaf alone that are averages: the stem's diameter is as sure as it was, the leaf's is not."""
+    likelihood, state = scene(4, n=1500)
+    random = np.random.default_rng(0)
+    on_leaf = likelihood.evaluate(state).scores[:, -2] + state.share[0] < 0.5
+    rough = likelihood.points.copy()
+    rough[on_leaf] += 0.4 * smooth_noise(rough[on_leaf], 1.0, 1.0, random)
+    moved = likelihood.at(rough)
+    found = score_dependence(moved, state)
+    assert found.stem.correlation < 0.1
+    assert found.leaf.reach_cm == pytest.approx(np.sqrt(2.0), rel=REACH)
+    scores = moved.evaluate(state).scores
+    varied = np.diag(found.variability) / np.diag(scores.T @ scores)
+    assert varied[0] == pytest.approx(1.0, abs=0.2)  # of the stem's diameter
+    assert varied[3] > 2.0  # of the leaf's length
 
 
 # correlation over distance

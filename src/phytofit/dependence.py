@@ -1,6 +1,8 @@
 """How far errors of neighbouring points depend on each other, and what that does to an estimate's variance."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,24 +23,35 @@ SURE = 0.9  # probability of its organ, of a point whose error is looked at
 N_PROBED = 250  # points whose neighbours' errors are compared with theirs
 LAG_CM = 0.25  # width of the distance classes for that
 LONGEST_CM = 10.0
+MIDDLES_CM: FloatArray = LAG_CM * (np.arange(round(LONGEST_CM / LAG_CM)) + 0.5)
 REACHES_CM = np.geomspace(0.2, 6.0, 30)
-CLEAR = 4.0  # standard errors by which a correlation must differ from none
+CLEAR, CLEAR_OF_ORGAN = 4.0, 3.0  # standard errors by which a correlation must differ from none: of all, of an organ
 CELL = 0.5  # of the reach: points within such a cell count as one place
 N_PIECES, LEAST_ON_PIECE = 15, 40  # of the leaf, whose width is compared with the model's; points
 CUT = 2.5  # reaches at which the correlation counts as none
+
+
+class Bell(NamedTuple):
+    """Correlation of errors over distance: at none, and the standard deviation of its bell, cm; 0 if there is none."""
+
+    correlation: float
+    reach_cm: float
+
+
+NONE = Bell(0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Dependence:
     """``variability`` (k, k): covariance of the sum of the scores; ``inflation``: how many times that of independent
     points it is, on average; ``n_independent``: number of independent points whose mean error varies as much;
-    ``reach_cm``: standard deviation of the correlation's bell, 0 if there is none; ``correlation`` at no distance."""
+    ``stem``, ``leaf``: how errors of neighbours on each are correlated."""
 
     variability: FloatArray
     inflation: float
     n_independent: float
-    reach_cm: float
-    correlation: float
+    stem: Bell
+    leaf: Bell
 
 
 def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependence | None = None) -> Dependence:
@@ -49,7 +62,8 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
     A spatial sandwich (Conley, J. Econometrics 92, 1999), but with a correlation that is first fitted to the points'
     distances from the surface: a bell over distance, a exp(-d² / (2 reach²)).  A score depends on a point's place on
     the surface, which is random too, so that products of neighbours' scores would not do; only the part that follows
-    the errors counts, the scores' change when a point is moved.  Misfit of the model is correlated as well, and counts.
+    the errors counts, the scores' change when a point is moved.  Misfit of the model is correlated as well, and counts;
+    where it is clearly less on one of stem and leaf, the bell is lower there.
     """
     scores = likelihood.evaluate(state).scores
     independent = scores.T @ scores
@@ -62,35 +76,52 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
     std = np.where((on_stem > 0.5)[:, np.newaxis], noise[0], [noise[1], noise[1], across])  # tangent, lateral, normal
     errors = distance / std[:, 2]
     sure = np.maximum(on_stem, 1.0 - on_stem - outlier) > SURE
-    for organ in (sure & (on_stem > 0.5), sure & (on_stem <= 0.5)):
-        errors[organ] -= errors[organ].mean() if organ.any() else 0.0  # noise moves points off a tube on average
+    organs_of = (on_stem > 0.5, on_stem <= 0.5)
+    for organ in organs_of:
+        one = sure & organ
+        errors[one] -= errors[one].mean() if one.any() else 0.0  # noise moves points off a tube on average
     # places on the surface: points that are near each other in space have been moved alike, by selection
     place = likelihood.points - distance[:, np.newaxis] * frame[:, :, 2]
-    correlation, reach = (
-        _correlation(place[sure], errors[sure]) if known is None else (known.correlation, known.reach_cm)
-    )
-    if correlation == 0.0:
-        return Dependence(independent, 1.0, float(len(scores)), 0.0, 0.0)
+    bells = [NONE, NONE]
+    if known is not None:
+        bells = [known.stem, known.leaf]
+    elif (both := _correlation(place[sure], errors[sure])) != NONE:
+        bells = [_of_organ(place[sure & o], errors[sure & o], both) for o in organs_of]
+    if bells == [NONE, NONE]:
+        return Dependence(independent, 1.0, float(len(scores)), NONE, NONE)
 
-    cell = np.floor(place / (CELL * reach)).astype(np.int64)
+    changes = [_change_of_scores(likelihood, state, frame[:, :, a], std[:, a]) for a in range(3)]
+    variability, alike = independent.copy(), 0.0
+    for organ, bell in zip(organs_of, bells, strict=True):
+        if bell == NONE:
+            alike += np.count_nonzero(organ)
+            continue
+        extra, pairs = _alike(place[organ], [change[organ] for change in changes], bell.reach_cm)
+        variability += bell.correlation * extra
+        alike += bell.correlation * pairs + (1.0 - bell.correlation) * np.count_nonzero(organ)
+    factor = cho_factor(independent + np.diag(likelihood.precision + 1e-9))
+    inflation = float(np.trace(cho_solve(factor, variability + np.diag(likelihood.precision)))) / len(independent)
+    return Dependence(variability, max(1.0, inflation), len(scores) ** 2 / alike, *bells)
+
+
+def _alike(places: FloatArray, changes: Sequence[FloatArray], reach_cm: float) -> tuple[FloatArray, float]:
+    """Sum (k, k) over pairs of points at their `places` (n, 3), weighted by the bell of their distance, of products of
+    their scores' `changes` (n, k), but of points with themselves; and the sum of the weights of all pairs."""
+    cell = np.floor(places / (CELL * reach_cm)).astype(np.int64)
     number = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
     count = np.bincount(number)
-    center = np.stack([np.bincount(number, column) for column in place.T], axis=1) / count[:, np.newaxis]
-    pairs = cKDTree(center).query_pairs(CUT * reach, output_type="ndarray")
+    center = np.stack([np.bincount(number, column) for column in places.T], axis=1) / count[:, np.newaxis]
+    pairs = cKDTree(center).query_pairs(CUT * reach_cm, output_type="ndarray")
     gap = np.linalg.norm(center[pairs[:, 0]] - center[pairs[:, 1]], axis=1)
-    weight = coo_array((np.exp(-0.5 * (gap / reach) ** 2), pairs.T), shape=(len(count), len(count))).tocsr()
-    extra = np.zeros_like(independent)
-    for a in range(3):
-        change = _change_of_scores(likelihood, state, frame[:, :, a], std[:, a])
+    weight = coo_array((np.exp(-0.5 * (gap / reach_cm) ** 2), pairs.T), shape=(len(count), len(count))).tocsr()
+    extra = np.zeros((changes[0].shape[1],) * 2)
+    for change in changes:
         sums = np.stack([np.bincount(number, column) for column in change.T], axis=1)
         cross = sums.T @ (weight @ sums)
         extra += sums.T @ sums - change.T @ change + cross + cross.T
     values, vectors = np.linalg.eigh(extra)  # a bell that is cut off is not quite positive
-    variability = independent + correlation * (vectors * np.maximum(values, 0.0)) @ vectors.T
-    factor = cho_factor(independent + np.diag(likelihood.precision + 1e-9))
-    inflation = float(np.trace(cho_solve(factor, variability + np.diag(likelihood.precision)))) / len(independent)
-    alike = correlation * float(count @ (weight @ count) * 2.0 + count @ count) + (1.0 - correlation) * len(scores)
-    return Dependence(variability, max(1.0, inflation), len(scores) ** 2 / alike, reach, correlation)
+    positive: FloatArray = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return positive, float(count @ (weight @ count) * 2.0 + count @ count)
 
 
 def _change_of_scores(likelihood: CloudLikelihood, state: State, direction: FloatArray, std: FloatArray) -> FloatArray:
@@ -143,27 +174,54 @@ def _local(organs: tuple[Organ, ...], points: FloatArray, on_stem: NDArray[np.bo
     return frame, distance
 
 
-def _correlation(points: FloatArray, errors: FloatArray) -> tuple[float, float]:
-    """Correlation at no distance and reach, cm, of a bell fitted to the products of errors (n,) of neighbours."""
-    if len(points) < 2:
-        return 0.0, 0.0
-    probed = np.unique(np.linspace(0, len(points) - 1, N_PROBED).astype(int))
-    n = int(LONGEST_CM / LAG_CM)
-    count, total = np.empty(n), np.empty(n)
-    sum_by_distance(points, errors, probed, LAG_CM, count, total)
-    mean = total / np.maximum(count, 1.0) / np.mean(errors**2)
-    middle = (np.arange(n) + 0.5) * LAG_CM
-    twice = 2.0 if len(probed) == len(points) else 1.0  # each pair was met twice
-    best, found = np.inf, (0.0, 0.0)
-    for reach in REACHES_CM:
-        bell = np.exp(-0.5 * (middle / reach) ** 2)
-        height, below, square = _line(bell, mean, count)
+class _Products(NamedTuple):
+    """Number of pairs of points and mean product of their errors, in units of their square's mean, by the distance
+    between them (`MIDDLES_CM`); and how often each pair was met."""
+
+    pairs: FloatArray
+    mean: FloatArray
+    met: float
+
+    @classmethod
+    def of(cls, points: FloatArray, errors: FloatArray) -> "_Products":
+        probed = np.unique(np.linspace(0, len(points) - 1, N_PROBED).astype(int))
+        count, total = np.empty_like(MIDDLES_CM), np.empty_like(MIDDLES_CM)
+        sum_by_distance(points, errors, probed, LAG_CM, count, total)
+        mean = total / np.maximum(count, 1.0) / np.mean(errors**2)
+        return cls(count, mean, 2.0 if len(probed) == len(points) else 1.0)
+
+    def height(self, reach_cm: float) -> tuple[float, float, float]:
+        """Of the bell of this reach that fits best; its standard error; and what the fit leaves."""
+        bell = np.exp(-0.5 * (MIDDLES_CM / reach_cm) ** 2)
+        height, below, square = _line(bell, self.mean, self.pairs)
         if below > 0.0:
-            height, below, square = float(count @ (bell * mean)) / float(count @ bell**2), 0.0, float(count @ bell**2)
-        misfit = float(count @ (mean - below - height * bell) ** 2)
-        if height * np.sqrt(square / twice) > CLEAR and misfit < best:
-            best, found = misfit, (min(height, 1.0), float(reach))
+            square = float(self.pairs @ bell**2)
+            height, below = float(self.pairs @ (bell * self.mean)) / square, 0.0
+        misfit = float(self.pairs @ (self.mean - below - height * bell) ** 2)
+        return height, np.sqrt(self.met / square), misfit
+
+
+def _correlation(points: FloatArray, errors: FloatArray) -> Bell:
+    """The bell that fits the products of errors (n,) of neighbours best, of those that are clear."""
+    if len(points) < 2:
+        return NONE
+    products = _Products.of(points, errors)
+    best, found = np.inf, NONE
+    for reach in REACHES_CM.tolist():
+        height, error, misfit = products.height(reach)
+        if height > CLEAR * error and misfit < best:
+            best, found = misfit, Bell(min(height, 1.0), reach)
     return found
+
+
+def _of_organ(points: FloatArray, errors: FloatArray, both: Bell) -> Bell:
+    """The bell of one organ: that of both, unless its own is clearly lower."""
+    if len(points) < 2:
+        return both
+    height, error, _ = _Products.of(points, errors).height(both.reach_cm)
+    if height + CLEAR_OF_ORGAN * error >= both.correlation:
+        return both
+    return both._replace(correlation=height) if height > CLEAR_OF_ORGAN * error else NONE
 
 
 def _line(x: FloatArray, y: FloatArray, count: FloatArray) -> tuple[float, float, float]:

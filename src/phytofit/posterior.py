@@ -55,7 +55,7 @@ class Estimate:
     the cloud, up to a constant of the cloud; ``inflation``: how many times more the errors vary than those of
     independent points would; ``misfit_cm``: how far the blade's surface lies off the model's, as the errors that
     neighbours share say; ``width_misfit``: by what share its width is off the model's, place by place;
-    ``correlated_cm``: how far errors of neighbours are correlated, 0 if they are not;
+    ``correlated_cm``: how far errors of neighbours on the leaf are correlated, 0 if they are not;
     ``rival`` (m,): parameters of the other model, if it is about as probable;
     ``quantile``: standard errors to either side of a 95 % interval, Student's; ``sighting``: what of the phytomer the
     cloud shows; ``dithered``: whether noise was added to the points, which had none.
@@ -390,9 +390,9 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         error=at.error,
         evidence=chosen.evidence,
         inflation=dependence.inflation,
-        misfit_cm=float(np.sqrt(dependence.correlation) * np.hypot(*state.noise[1:])),
+        misfit_cm=float(np.sqrt(dependence.leaf.correlation) * np.hypot(*state.noise[1:])),
         width_misfit=width_misfit(likelihood, state, at.scores),
-        correlated_cm=dependence.reach_cm,
+        correlated_cm=dependence.leaf.reach_cm,
         rival=chosen.rival,
         quantile=float(stdtrit(left, 0.975)),
         converged=end.converged,
