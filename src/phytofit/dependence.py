@@ -23,7 +23,7 @@ SURE = 0.9  # probability of its organ, of a point whose error is looked at
 N_PROBED = 250  # points whose neighbours' errors are compared with theirs
 LAG_CM = 0.25  # width of the distance classes for that
 LONGEST_CM = 10.0
-MIDDLES_CM: FloatArray = LAG_CM * (np.arange(round(LONGEST_CM / LAG_CM)) + 0.5)
+MIDDLES_CM: FloatArray = LAG_CM * (np.arange(round(LONGEST_CM / LAG_CM), dtype=np.float64) + 0.5)
 REACHES_CM = np.geomspace(0.2, 6.0, 30)
 CLEAR, CLEAR_OF_ORGAN = 4.0, 3.0  # standard errors by which a correlation must differ from none: of all, of an organ
 CELL = 0.5  # of the reach: points within such a cell count as one place
