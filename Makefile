@@ -35,6 +35,8 @@ bench: install
 bench-accuracy: install
 	$(BIN)/python benchmarks/trust.py
 	$(BIN)/python benchmarks/robustness.py
+	$(BIN)/python benchmarks/evidence.py
+	$(BIN)/python benchmarks/sections.py --out docs/images
 	$(BIN)/python benchmarks/accuracy.py
 
 docs: install
