@@ -143,17 +143,20 @@ def width_misfit(likelihood: CloudLikelihood, state: State, scores: FloatArray) 
     place, lateral = place[on_leaf], across[on_leaf, 0]
     half = np.interp(place * lengths.sum(), np.concatenate([[0.0], np.cumsum(lengths)]), leaf.half_width)
     ratio, chance = [], []
+    whole = np.all(likelihood.density == 1.0, axis=1)  # what is left around a hole says nothing of the width
     for i in range(1, N_PIECES - 2):  # not where stem and tip are
+        low, high = (int(np.floor(end * len(whole) / N_PIECES)) for end in (i, i + 1))
         those = (place * N_PIECES).astype(int) == i
         n = np.count_nonzero(those)
-        if n < LEAST_ON_PIECE:
+        if n < LEAST_ON_PIECE or not whole[low:high].all():
             continue
         wide = np.mean(half[those] ** 2) / 3.0
         ratio.append(np.sqrt(max(0.0, np.mean(lateral[those] ** 2) - state.noise[1] ** 2) / wide))
         chance.append(0.2 / n * (1.0 + state.noise[1] ** 2 / wide) ** 2)
     if len(ratio) < 3:
         return 0.0
-    return float(np.sqrt(max(0.0, np.var(ratio, ddof=1) - np.mean(chance))))
+    spread = 1.4826 * np.median(np.abs(ratio - np.median(ratio)))  # a hole that is not known of is no misfit
+    return float(np.sqrt(max(0.0, spread**2 - np.mean(chance))))
 
 
 def _local(organs: tuple[Organ, ...], points: FloatArray, on_stem: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
