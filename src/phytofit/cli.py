@@ -20,10 +20,12 @@ from phytofit.formats import read_cloud, write_cloud
 from phytofit.optimize import Generation
 from phytofit.preparation import AXES, parse_up
 from phytofit.recipe import defaults, recipe
+from phytofit.report import agreement_page, agreement_table
 from phytofit.results import prepare_folder, result_names, save_fit, table_text, trait_table, write_text
 from phytofit.simulation import SimulatedPhytomer, simulate
 from phytofit.species import Species, load_species, species_names
 from phytofit.traits import Trait, measure
+from phytofit.validation import agreement, compare, read_measures, read_results
 
 __all__ = ["app", "main"]
 
@@ -38,6 +40,7 @@ out = Console()
 err = Console(stderr=True)
 FIT = defaults(fit)
 SIMULATE = defaults(simulate)
+SHOWN = ("n", "bias", "RMSE", "R", "CCC", "covered", "flagged")  # of an agreement, on the screen
 
 
 def _by_method(setting: str) -> str:
@@ -243,6 +246,53 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
     out.print(table)
     _print_remarks(result)
     out.print(f"The model on the points: {where / 'fit.png'}", highlight=False)
+
+
+@app.command("validate")
+def validate_command(
+    results: Annotated[Path, typer.Argument(help="Folder of results of `phytofit fit`, or its traits.csv.")],
+    truth: Annotated[
+        Path,
+        typer.Option(help="CSV of hand measures: a row a cloud, columns such as leaf_length_cm, 'Leaf angle (deg)'."),
+    ],
+    folder: OutOption = Path("validation"),
+) -> None:
+    """Compare results with hand measures: bias, errors, correlation, concordance, limits of agreement, coverage.
+
+    Prints a table and writes DIR/validation.html (the same with plots, in one file), DIR/validation.csv (the
+    statistics) and DIR/pairs.csv (each cloud and trait that both have).
+
+    Example:
+
+        phytofit validate results --truth measurements.csv
+    """
+    measures = _or_exit(lambda: read_measures(truth))
+    comparison = _or_exit(lambda: compare(measures, read_results(results)))
+    found = agreement(comparison.pairs)
+    for text in comparison.unmatched:
+        out.print(f"note: {text}", highlight=False)
+    if not found:
+        _complain(
+            f"{truth}: none of its clouds and traits is among those of {results}; are the clouds' names the same?"
+        )
+        raise typer.Exit(2)
+    _or_exit(lambda: prepare_folder(folder))
+    shown = agreement_table(found)
+    table = Table(title=f"{results} against {truth.name}")
+    for column in ("trait", *SHOWN):
+        table.add_column(column, justify="left" if column == "trait" else "right", no_wrap=True)
+    for name, row in zip(shown.index, shown[list(SHOWN)].to_numpy(), strict=True):
+        table.add_row(str(name), *row)
+    page = agreement_page(comparison, found, f"Results in {results.name} against {truth.name}")
+    statistics = pd.DataFrame(found).assign(outliers=["; ".join(a.outliers) for a in found])
+    _or_exit(lambda: write_text(folder / "pairs.csv", table_text(comparison.pairs)))
+    _or_exit(lambda: write_text(folder / "validation.csv", table_text(statistics)))
+    _or_exit(lambda: write_text(folder / "validation.html", page))
+    out.print(table)
+    for a in found:
+        if a.outliers:
+            out.print(f"note: {a.trait} is far off in {', '.join(a.outliers)}", highlight=False)
+    out.print(f"With plots: {folder / 'validation.html'}", highlight=False)
 
 
 @app.command("recipe")
