@@ -189,15 +189,30 @@ def real(pool: ProcessPoolExecutor) -> None:
     print(f"hand measures within the interval: {held} of {sum(map(len, errors.values()))}")
     for name, values in errors.items():
         print(f"  {name:16} mean absolute error {np.mean(values):5.1f} {'deg' if name == 'leaf_angle' else '%'}")
-    print("\nThe authors' simulated clouds: fitted parameter (theirs)")
+    print("\nThe authors' simulated clouds: fitted parameter (theirs); last, the trait leaf_angle (of their leaf)")
     names = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width")
-    print(f"{'':18}" + "".join(f"{name:>20}" for name in names))
+    print(f"{'':18}" + "".join(f"{name:>20}" for name in (*names, "trait leaf_angle")))
     for path in paths:
         if "simulated" in path.parts:
             theirs = dict(row.split() for row in path.with_suffix(".txt").read_text().splitlines())
             parameters = results[path].parameters
             cells = "".join(f"{parameters[n]:11.2f} ({float(theirs[n]):6.2f})" for n in names)
+            angles = [
+                next(t.value for t in traits if t.name == "leaf_angle")
+                for traits in (results[path].traits, phytofit.measure(authors_organs(theirs)))
+            ]
+            cells += f"{angles[0]:11.2f} ({angles[1]:6.2f})"
             print(f"{path.parent.name}/{path.stem:6}{cells}  {'; '.join(results[path].flags)}")
+
+
+def authors_organs(theirs: dict[str, str]) -> tuple[phytofit.Organ, ...]:
+    """Stem and leaf as the authors' generator grows them, up to where the leaf hangs down: the stem is twice its
+    internode, the leaf starts at its surface, and each piece bends by 1.5 degrees more than their parameter says."""
+    value = {name: float(text) for name, text in theirs.items()}
+    stem = value["stem_internode_len"]
+    leaf = value["leaf_angle"], value["leaf_length"], value["leaf_width"], value["leaf_rotate_angle"] + 1.5
+    x = np.array([value["stem_diameter"], stem, *leaf, stem, 1.0])
+    return tuple(organ.row(0) for organ in SPECIES.model.organs(x))
 
 
 class Leaf(NamedTuple):
