@@ -63,7 +63,7 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
     distances from the surface: a bell over distance, a exp(-d² / (2 reach²)).  A score depends on a point's place on
     the surface, which is random too, so that products of neighbours' scores would not do; only the part that follows
     the errors counts, the scores' change when a point is moved.  Misfit of the model is correlated as well, and counts;
-    where it is clearly less on one of stem and leaf, the bell is lower there.
+    where it is far less on one of stem and leaf, the bell is lower there.
     """
     scores = likelihood.evaluate(state).scores
     independent = scores.T @ scores
@@ -218,11 +218,12 @@ def _correlation(points: FloatArray, errors: FloatArray) -> Bell:
 
 
 def _of_organ(points: FloatArray, errors: FloatArray, both: Bell) -> Bell:
-    """The bell of one organ: that of both, unless its own is clearly lower."""
+    """The bell of one organ: that of both, unless its own is clearly lower than half of it (a fit takes up more of the
+    errors of the smaller organ)."""
     if len(points) < 2:
         return both
     height, error, _ = _Products.of(points, errors).height(both.reach_cm)
-    if height + CLEAR_OF_ORGAN * error >= both.correlation:
+    if height + CLEAR_OF_ORGAN * error >= 0.5 * both.correlation:
         return both
     return both._replace(correlation=height) if height > CLEAR_OF_ORGAN * error else NONE
 
