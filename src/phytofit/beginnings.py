@@ -56,18 +56,18 @@ def turned_blade(species: Species, likelihood: CloudLikelihood, state: State, sc
     yield State(np.concatenate([inside, theta[state.n_parameters :]]), state.pose, state.center)
 
 
-def lower_insertion(species: Species, state: State, share: float = LOWER) -> Iterator[State]:
+def lower_insertion(species: Species, state: State) -> Iterator[State]:
     """The state with a leaf that leaves the stem lower down, along it at first, and then lies where it lay: a leaf that
     hugs the stem is a local optimum away from one that leaves it higher up, at once."""
     space, x = species.space, state.x
-    drop = min(share * x[3], x[1] - space.lower[1])
+    drop = min(LOWER * x[3], x[1] - space.lower[1])
     if drop < LEAST_LOWER_CM:
         return
     from_tip = np.linspace(0.0, x[3] - drop, 12)
     there = _midrib(species, x[np.newaxis], from_tip)[0]
     other = x.copy()
     other[1], other[6], other[space.index("collar_offset")] = x[1] - drop, x[6] + drop, 1.0
-    other[2], other[3] = x[2] - 0.5 * x[2], x[3] + drop
+    other[2], other[3] = 0.5 * x[2], x[3] + drop
     bent = [space.index(name) for name in BENT if name in space.names]
     yield _with_x(state, _following(species, other, bent, there, from_tip))
 
