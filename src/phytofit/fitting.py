@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from threadpoolctl import threadpool_limits
 
 from phytofit.cloud import PointCloud, from_points
 from phytofit.distances import DISTANCES, Reference
@@ -257,7 +258,8 @@ def fit(
     means = [mean_at(start, species.leading(N_SEARCHED).space) for start in found.starts]
     if random_start:
         means[0] = _random_mean(species.leading(N_SEARCHED).space, seed)
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
+    one_thread = threadpool_limits(limits=1, user_api="blas")  # more would round sums in another order
+    with one_thread, ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
         result = METHODS[method](
             found, species, means, n_points=n_points, seed=seed, executor=executor, progress=progress, **search
         )
