@@ -2,25 +2,27 @@
 
 In the manner of the paper's refs. [4] and [5]: the stem is a region, the rest is the leaf; the leaf's length is that of
 a geodesic from the stem, its width that of a cross-section, its angle that of a tangent.  It is handed the stem's axis
-by phytofit, which is more than those have.
+by phytofit, which is more than those have; pieces of the leaf are joined over gaps.  Its constants were chosen on
+simulated phytomers with 0.05 and 0.5 cm of noise, whole and with holes, other than those that it is measured on.
 """
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 import phytofit
 from phytofit.traits import CHORD_CM
 
-VOXEL_CM = 0.4
-NEIGHBORS = 12
-STEM_MARGIN, STEM_SCATTER = 1.15, 3.0  # of the stem's radius, and of its points' scatter, within which points are its
-SECTION_CM = 2.0  # of geodesic distance: one section of the leaf
+VOXEL_CM = 0.25
+NEIGHBORS = 16
+STEM_MARGIN, STEM_SCATTER = 1.3, 4.0  # of the stem's radius, and of its points' scatter, within which points are its
+SECTION_CM = 1.5  # of geodesic distance: one section of the leaf
 LEAST_IN_SECTION = 4  # points
+BRIDGE_CM = 7.0  # the widest gap over which pieces are joined, somewhat more than the paper's spheres
 SMOOTHING = (0.25, 0.5, 0.25)  # of the midrib's nodes
 WIDTH_QUANTILES = (0.05, 0.95)  # of a section's points across: nine tenths of its width
-WIDEST = 0.85  # quantile of the sections' widths, which noise widens
+WIDEST = 0.8  # quantile of the sections' widths, which noise widens
 
 
 def measure(points: np.ndarray, seed_point: np.ndarray | None = None) -> dict[str, float]:
@@ -75,12 +77,28 @@ def from_stem(leaf: np.ndarray, radius: float) -> np.ndarray:
     n = len(leaf)
     gap, near = cKDTree(leaf).query(leaf, k=NEIGHBORS + 1)
     rows = np.repeat(np.arange(n), NEIGHBORS)
-    graph = coo_array((gap[:, 1:].ravel(), (rows, near[:, 1:].ravel())), shape=(n, n)).tocsr()
+    graph = bridged(leaf, coo_array((gap[:, 1:].ravel(), (rows, near[:, 1:].ravel())), shape=(n, n)).tocsr())
     piece = connected_components(graph, directed=False)[1]
     rest = np.hypot(leaf[:, 0], leaf[:, 1]) - radius
     largest = piece == np.argmax(np.bincount(piece))
     first = np.flatnonzero(largest)[np.argsort(rest[largest])[:NEIGHBORS]]
     return dijkstra(graph, directed=False, indices=first, min_only=True) + max(0.0, float(rest[first].min()))
+
+
+def bridged(leaf: np.ndarray, graph: csr_array) -> csr_array:
+    """The graph with its pieces joined, each to the largest by the shortest way, as far as `BRIDGE_CM` reaches."""
+    while True:
+        count, piece = connected_components(graph, directed=False)
+        size = np.bincount(piece)
+        largest = np.flatnonzero(piece == np.argmax(size))
+        others = np.flatnonzero((piece != np.argmax(size)) & (size[piece] > NEIGHBORS))
+        if count == 1 or len(others) == 0:
+            return graph
+        gap, near = cKDTree(leaf[largest]).query(leaf[others])
+        best = int(np.argmin(gap))
+        if gap[best] > BRIDGE_CM:
+            return graph
+        graph = graph + coo_array(([gap[best]], ([others[best]], [largest[near[best]]])), shape=graph.shape).tocsr()
 
 
 def sections(leaf: np.ndarray, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from phytofit.errors import (
     Status,
     UnitError,
 )
-from phytofit.fitting import Fit, fit
+from phytofit.fitting import Fit, fit, mean_at
 from phytofit.formats import read_cloud, write_cloud
 from phytofit.likelihood import CloudLikelihood
 from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move
@@ -34,11 +34,14 @@ from phytofit.results import save_fit, trait_table
 from phytofit.simulation import SimulatedPhytomer, add_noise, add_outliers, occlude, simulate
 from phytofit.species import Species, load_species
 from phytofit.traits import Trait, measure
+from phytofit.validation import Agreement, Comparison, agreement, compare, read_measures, read_results
 
 __all__ = [
     "DISTANCES",
+    "Agreement",
     "CloudError",
     "CloudLikelihood",
+    "Comparison",
     "CrossEntropy",
     "Estimate",
     "Fit",
@@ -67,9 +70,12 @@ __all__ = [
     "UnitError",
     "add_noise",
     "add_outliers",
+    "agreement",
+    "compare",
     "fit",
     "from_points",
     "load_species",
+    "mean_at",
     "measure",
     "mesh",
     "minimise",
@@ -79,6 +85,8 @@ __all__ = [
     "plot_fit",
     "prepare",
     "read_cloud",
+    "read_measures",
+    "read_results",
     "recipe",
     "remove_outliers",
     "save_fit",

@@ -1,0 +1,56 @@
+"""Jobs done once: what each returned is kept, so that an evaluation that was stopped goes on from there."""
+
+import hashlib
+import sys
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from joblib import Memory, Parallel, delayed
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+import phytofit
+
+KEPT = Path(__file__).parent / ".kept"
+SOURCES = (Path(phytofit.__file__).parent, Path(__file__).parent, Path(__file__).parents[1] / "benchmarks")
+LIBRARIES = ("numpy", "scipy", "numba")
+COLUMNS = (
+    TextColumn("{task.description}"),
+    BarColumn(),
+    MofNCompleteColumn(),
+    TimeElapsedColumn(),
+    TimeRemainingColumn(),
+)
+console = Console()
+
+
+def state_of_the_code() -> str:
+    """A name for the code as it is: what another state of it has kept is not this one's."""
+    found = hashlib.sha256(" ".join(version(name) for name in LIBRARIES).encode())
+    for folder in SOURCES:
+        for path in sorted(path for ending in ("*.py", "*.toml") for path in folder.rglob(ending)):
+            found.update(path.relative_to(folder.parent).as_posix().encode() + path.read_bytes())
+    return found.hexdigest()[:12]
+
+
+def kept(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, which does for the same arguments nothing twice, not even in another run."""
+    done: Callable[..., Any] = Memory(KEPT / state_of_the_code(), verbose=0).cache(function)
+    return done
+
+
+def run_all(
+    function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], title: str, *, one_by_one: bool = False
+) -> list[Any]:
+    """What the function returns for each job, in their order; on all cores unless one by one, as where time counts."""
+    work = Parallel(n_jobs=1 if one_by_one else -1, return_as="generator", batch_size=1)
+    results = []
+    with Progress(*COLUMNS, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task(title, total=len(jobs))
+        for result in work(delayed(kept(function))(*job) for job in jobs):
+            results.append(result)
+            bar.advance(task)
+    console.print(f"{title}: {len(jobs)} jobs done", highlight=False)
+    return results
