@@ -95,19 +95,12 @@ def with_outliers(made: phytofit.SimulatedPhytomer, share: float, random: np.ran
     return np.concatenate([made.points, phytofit.add_outliers(made.points, share / (1.0 - share), random)])
 
 
-def from_one_side(made: phytofit.SimulatedPhytomer, views: float, random: np.random.Generator) -> np.ndarray:
-    """As seen from so many cameras: each sees the near half of the stem, and the leaf but for what the stem hides."""
-    points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
-    radius = made.organs[0].half_width[0]
-    turn = random.uniform(0.0, 2.0 * np.pi)
-    seen = np.zeros(len(points), bool)
-    for view in range(int(views)):
-        angle = turn + 2.0 * np.pi * view / views
-        toward, across = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
-        depth, side = points @ toward, points @ across
-        behind = (np.abs(side) < radius) & (depth < 0.0) & (points[:, 2] > 0.0)
-        seen |= np.where(made.labels == 1, depth > 0.0, ~behind)
-    return made.points[seen]
+def from_cameras(made: phytofit.SimulatedPhytomer, views: float, random: np.random.Generator) -> np.ndarray:
+    """As so many cameras see it."""
+    number = int(random.integers(2**31))
+    return phytofit.simulate(
+        SPECIES, fixed=dict(zip(SPECIES.space.names, made.x.tolist(), strict=True)), n_views=int(views), seed=number
+    ).points
 
 
 def fewer(made: phytofit.SimulatedPhytomer, n_points: float, random: np.random.Generator) -> np.ndarray:
@@ -136,7 +129,7 @@ SWEEPS = {
     "leaf removed": Sweep("share", (0.0, 0.1, 0.2, 0.4, 0.6), with_holes),
     "tip cut off": Sweep("share of the midrib", (0.0, 0.05, 0.1, 0.2, 0.3), without_tip),
     "outliers": Sweep("share of the points", (0.0, 0.1, 0.2, 0.3, 0.4), with_outliers),
-    "views": Sweep("cameras around the plant", (1.0, 2.0, 3.0, 6.0), from_one_side),
+    "views": Sweep("cameras around the plant", (1.0, 2.0, 3.0, 6.0), from_cameras),
     "points": Sweep("number", (300.0, 1000.0, 2500.0, 5000.0), fewer),
     "leaves of others": Sweep("number, and a wall", (0.0, 1.0, 2.0, 4.0), among_others, seeded=True),
 }

@@ -62,22 +62,13 @@ class Row(NamedTuple):
     n_parameters: int
 
 
-def correlated_noise(points: np.ndarray, noise_cm: float, reach_cm: float, random: np.random.Generator) -> np.ndarray:
-    """The points with noise of which neighbours share most: white noise averaged over `reach_cm` around each point."""
-    white = random.standard_normal(points.shape)
-    smooth = np.array(
-        [white[near].sum(axis=0) / np.sqrt(len(near)) for near in cKDTree(points).query_ball_point(points, reach_cm)]
-    )
-    return points + noise_cm * smooth
-
-
 def fit_simulated(job: Job) -> Row:
     seed = FIRST_SEED + job.number
     noise = 0.0 if job.correlated_cm else job.noise_cm
     made = phytofit.simulate(SPECIES, n_points=job.n_points, noise_cm=noise, seed=seed)
     points = made.points
     if job.correlated_cm:
-        points = correlated_noise(points, job.noise_cm, job.correlated_cm, np.random.default_rng(seed))
+        points = phytofit.add_noise(points, job.noise_cm, np.random.default_rng(seed), job.correlated_cm)
     result = phytofit.fit(points, "cm", seed=0, threads=1)
     truth = phytofit.measure(made.organs)
     low, high = np.array(list(result.parameter_intervals.values()))[:N_PARAMETERS].T

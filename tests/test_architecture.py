@@ -19,6 +19,7 @@ LAYERS = [
     {"results"},
     {"report", "viewer", "export"},
     {"plots"},
+    {"trials"},
     {"validation"},
     {"batch"},
     {"pipeline"},

@@ -8,10 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
+from scipy.spatial import cKDTree
 
 from phytofit.errors import SettingError
 from phytofit.models import LEAF, STEM, Phytomer, move
-from phytofit.simulation import add_noise, add_outliers, occlude, random_pose, simulate
+from phytofit.simulation import add_noise, add_outliers, occlude, random_pose, simulate, visible
 from phytofit.species import load_species
 from phytofit.traits import measure
 
@@ -230,3 +231,48 @@ def test_one_point():
 def test_bad_settings_are_named(settings, message):
     with pytest.raises(SettingError, match=message):
         simulate(**settings)
+
+
+def test_noise_with_a_reach_is_shared_by_neighbours_and_as_large_as_asked_for():
+    random = np.random.default_rng(0)
+    points = random.uniform(0.0, 20.0, (6000, 3)) * [1.0, 1.0, 0.05]
+    off = add_noise(points, 0.4, random, reach_cm=2.0) - points
+    assert off.std() == pytest.approx(0.4, rel=0.15)  # some 36 independent patches
+    _, near = cKDTree(points).query(points, k=2)
+    assert np.corrcoef(off[:, 0], off[near[:, 1], 0])[0, 1] > 0.8
+    far = random.permutation(6000)
+    apart = np.linalg.norm(points - points[far], axis=1) > 4.5
+    assert abs(np.corrcoef(off[apart, 0], off[far[apart], 0])[0, 1]) < 0.2
+
+
+@given(st.floats(0.0, 2 * math.pi), st.floats(-1.0, 1.0))
+def test_a_camera_sees_the_near_side_of_a_bare_stem(azimuth, height):
+    """Closed form: a point on a cylinder is seen if its normal looks towards the camera."""
+    stem = SPECIES.model.organs(SPECIES.space.mean)[0].row(0)
+    radius, length = stem.half_width[0], stem.segment_lengths.sum()
+    random = np.random.default_rng(1)
+    turn, z = random.uniform(0, 2 * math.pi, 400), random.uniform(0.0, length, 400)
+    points = stem.axis[0] + np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
+    toward = np.array([math.cos(azimuth), math.sin(azimuth), height])
+    facing = points[:, :2] @ toward[:2] / radius / np.linalg.norm(toward)
+    inside = (z > 4 * radius) & (z < length - 4 * radius)  # through its open ends a tube's far side is seen
+    seen = visible(points, [stem], toward)
+    assert seen[inside & (facing > 0.35)].all()  # where it is more slanted a pixel reaches too deep
+    assert not seen[inside & (facing < -0.5)].any()
+
+
+def test_more_cameras_see_more_and_all_points_asked_for_come():
+    one, two = (simulate(n_points=2000, n_views=n, noise_cm=0.0, random_orientation=False, seed=8) for n in (1, 2))
+    assert one.points.shape == two.points.shape == (2000, 3)
+    np.testing.assert_array_equal(one.x, two.x)
+    # the upper half is left out: from above, the far side is seen through the stem's open end
+    on_stem = [p[p[:, 2] < np.median(p[:, 2])] for p in (made.points[made.labels == 1] for made in (one, two))]
+    around = [np.unique(np.floor(np.degrees(np.arctan2(p[:, 1], p[:, 0])) / 10.0)).size for p in on_stem]
+    assert around[0] < 24  # of 36 sectors: a camera sees half of a stem, and something beyond by the tolerance
+    assert around[1] == 36
+
+
+@pytest.mark.parametrize(("setting", "value"), [("n_views", 0), ("noise_reach_cm", -1.0)])
+def test_a_sensor_that_can_not_be_is_refused(setting, value):
+    with pytest.raises(SettingError, match="expected a number"):
+        simulate(**{setting: value})

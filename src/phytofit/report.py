@@ -9,10 +9,11 @@ from collections.abc import Sequence
 import pandas as pd
 from matplotlib.figure import Figure
 
-from phytofit.plots import plot_agreement
-from phytofit.validation import Agreement, Comparison
+from phytofit.plots import plot_agreement, plot_trials
+from phytofit.trials import Trial
+from phytofit.validation import Agreement, Comparison, agreement
 
-__all__ = ["agreement_page", "agreement_table"]
+__all__ = ["agreement_page", "agreement_table", "trial_page"]
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
@@ -25,9 +26,9 @@ img { max-width: 100%; } .note { color: #555; }
 """
 HEADINGS = ("n", "bias", "RMSE", "MAE", "R", "CCC", "limits of agreement", "covered", "flagged", "outliers")
 MEANING = (
-    "Differences are result minus hand measure. Bias is their mean; RMSE and MAE are their root mean square and mean "
+    "Differences are result minus {measure}. Bias is their mean; RMSE and MAE are their root mean square and mean "
     "size. R is Pearson's correlation, CCC Lin's concordance. The limits of agreement (Bland and Altman) hold 95 % of "
-    "the differences, if they are normal. Covered: hand measures within the results' 95 % intervals. Outliers: clouds "
+    "the differences, if they are normal. Covered: {measure}s within the results' 95 % intervals. Outliers: clouds "
     "whose difference is far from the others' (modified z-score above 3.5)."
 )
 
@@ -54,23 +55,48 @@ def agreement_table(found: Sequence[Agreement]) -> pd.DataFrame:
 
 def agreement_page(comparison: Comparison, found: Sequence[Agreement], title: str) -> str:
     """One self-contained HTML page: the statistics, two plots a trait, and what has no partner."""
-    parts = [
-        f"<h1>{html.escape(title)}</h1>",
-        _table(agreement_table(found)),
-        f'<p class="note">{html.escape(MEANING)}</p>',
-    ]
+    return _page(title, _agreement_parts(comparison, found, "by hand", "hand measure", "Without a partner"))
+
+
+def trial_page(
+    base: Trial, table: pd.DataFrame, answers: Sequence[str], percent: float, degrees: float, title: str
+) -> str:
+    """One self-contained HTML page: what points and views are needed, and the statistics with the sensor as it is."""
+    parts = ["<ul>", *(f"<li>{html.escape(text)}</li>" for text in answers), "</ul>"]
+    parts += [_image(plot_trials(table, percent, degrees), "errors by number of points and of views")]
+    shown = table.assign(within=(100.0 * table["within"]).round(), coverage=(100.0 * table["coverage"]).round())
+    shown = shown.rename(columns={"within": "within, %", "coverage": "covered, %", "rmse": "RMSE"})
+    parts += [_table(shown.set_index("setting").map(_short))]
+    parts += ["<h2>The sensor as it was described</h2>"]
+    found = agreement(base.comparison.pairs)
+    return _page(title, parts + _agreement_parts(base.comparison, found, "true", "true value", "Refused"))
+
+
+def _agreement_parts(
+    comparison: Comparison, found: Sequence[Agreement], against: str, measure: str, alone: str
+) -> list[str]:
+    parts = [_table(agreement_table(found)), f'<p class="note">{html.escape(MEANING.format(measure=measure))}</p>']
     for a in found:
         those = comparison.pairs[comparison.pairs["trait"] == a.trait]
-        parts += [f"<h2>{html.escape(a.trait.replace('_', ' '))}</h2>", _image(plot_agreement(those, a), a.trait)]
+        picture = _image(plot_agreement(those, a, against), a.trait)
+        parts += [f"<h2>{html.escape(a.trait.replace('_', ' '))}</h2>", picture]
     if comparison.unmatched:
-        parts.append("<h2>Without a partner</h2><ul>")
+        parts.append(f"<h2>{alone}</h2><ul>")
         parts += [f"<li>{html.escape(text)}</li>" for text in comparison.unmatched]
         parts.append("</ul>")
-    body = "\n".join(parts)
+    return parts
+
+
+def _page(title: str, parts: Sequence[str]) -> str:
+    body = "\n".join([f"<h1>{html.escape(title)}</h1>", *parts])
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
         f"<style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
     )
+
+
+def _short(cell: object) -> str:
+    return f"{cell:.3g}" if isinstance(cell, float) else str(cell)
 
 
 def _number(value: float) -> str:
@@ -78,7 +104,7 @@ def _number(value: float) -> str:
 
 
 def _table(table: pd.DataFrame) -> str:
-    head = "".join(f"<th>{html.escape(text)}</th>" for text in ("trait", *table.columns))
+    head = "".join(f"<th>{html.escape(text)}</th>" for text in (table.index.name or "trait", *table.columns))
     rows = "".join(
         "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in (name, *row)) + "</tr>"
         for name, row in zip(table.index, table.to_numpy(), strict=True)

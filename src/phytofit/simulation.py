@@ -1,18 +1,23 @@
 """Simulated phytomers: true organs to a cloud, with noise, removed spheres, outliers and a random pose."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from phytofit.errors import SettingError
 from phytofit.models import Organ, SurfaceSampler, move
 from phytofit.species import Species, load_species
 
-__all__ = ["SimulatedPhytomer", "add_noise", "add_outliers", "occlude", "random_pose", "simulate"]
+__all__ = ["SimulatedPhytomer", "add_noise", "add_outliers", "occlude", "random_pose", "simulate", "visible"]
 
 FloatArray = NDArray[np.float64]
+CAMERA_ABOVE_DEG = 20.0  # the cameras of `n_views` are so much above the horizon
+SPARE = 8  # times as many points are drawn as cameras are to see
+SCREEN_POINTS, PIXEL_CM = 250_000, 0.1  # of the depth buffer; some five points a pixel
+BEHIND_CM = 0.4  # so far behind the nearest point of its pixel a point is still of the same surface, seen at a slant
 OUTLIER_MARGIN = 0.25  # outliers fill the cloud's box, grown by this share of its size
 
 
@@ -34,6 +39,8 @@ def simulate(
     fixed: Mapping[str, float] | None = None,
     n_points: int = 5000,
     noise_cm: float = 0.5,
+    noise_reach_cm: float = 0.0,
+    n_views: int | None = None,
     n_spheres: int = 0,
     sphere_diameter_cm: float = 6.0,
     outlier_share: float = 0.0,
@@ -44,12 +51,16 @@ def simulate(
 
     Defaults are the paper's simulated protocol (section V); `n_spheres` of `sphere_diameter_cm` are its occlusions
     (Fig. 7).  `fixed` gives parameters by name that are not to be drawn.  `n_points` are drawn before spheres are
-    removed; `outlier_share` of the points that are left is added.
+    removed; `outlier_share` of the points that are left is added.  Noise is shared by neighbours as far as
+    `noise_reach_cm`, as in fused and stereo clouds, or independent.  `n_views` cameras see the points, evenly
+    spaced around the stem and looking down on it by `CAMERA_ABOVE_DEG`; None: from everywhere.
     """
     species = load_species() if species is None else species
     for name, value, low in (
         ("points", n_points, 1),
         ("noise", noise_cm, 0),
+        ("noise reach", noise_reach_cm, 0),
+        ("views", 1 if n_views is None else n_views, 1),
         ("spheres", n_spheres, 0),
         ("seed", seed, 0),
     ):
@@ -73,11 +84,18 @@ def simulate(
             )
         x[i] = value
     organs: tuple[Organ, ...] = tuple(o.row(0) for o in species.model.organs(x))
-    points, organ = SurfaceSampler(n_points, int(random.integers(2**31)), even=False).draw(organs)
+    n_drawn = n_points if n_views is None else SPARE * n_points
+    points, organ = SurfaceSampler(n_drawn, int(random.integers(2**31)), even=False).draw(organs)
     labels = organ.astype(np.int64) + 1
-    shuffle = random.permutation(n_points)  # a sensor's points come in no order of the model's
+    shuffle = random.permutation(n_drawn)  # a sensor's points come in no order of the model's
     points, labels = points[shuffle], labels[shuffle]
-    points = add_noise(points, noise_cm, random)
+    if n_views is not None:
+        turns = 2.0 * np.pi * (random.random() + np.arange(n_views) / n_views)
+        above = np.deg2rad(CAMERA_ABOVE_DEG)
+        cameras = np.stack([np.cos(above) * np.cos(turns), np.cos(above) * np.sin(turns), 0 * turns + np.sin(above)], 1)
+        seen = np.flatnonzero(np.any([visible(points, organs, toward) for toward in cameras], axis=0))[:n_points]
+        points, labels = points[seen], labels[seen]
+    points = add_noise(points, noise_cm, random, noise_reach_cm)
     for _ in range(n_spheres):
         keep = occlude(points, sphere_diameter_cm, random)
         points, labels = points[keep], labels[keep]
@@ -94,9 +112,30 @@ def simulate(
     return SimulatedPhytomer(points, labels, x, move(organs, pose), pose)
 
 
-def add_noise(points: FloatArray, std_cm: float, random: np.random.Generator) -> FloatArray:
-    """Points (n, 3) with independent Gaussian noise of zero mean on each coordinate."""
-    return points + random.normal(0.0, std_cm, points.shape)
+def add_noise(points: FloatArray, std_cm: float, random: np.random.Generator, reach_cm: float = 0.0) -> FloatArray:
+    """Points (n, 3) with Gaussian noise of zero mean on each coordinate, independent, or shared by neighbours: white
+    noise summed over those within `reach_cm` of each point, scaled to the same standard deviation."""
+    if reach_cm == 0.0:
+        return points + random.normal(0.0, std_cm, points.shape)
+    white = random.standard_normal(points.shape)
+    near = cKDTree(points).query_ball_point(points, reach_cm)
+    return points + std_cm * np.array([white[those].sum(axis=0) / np.sqrt(len(those)) for those in near])
+
+
+def visible(points: FloatArray, organs: Sequence[Organ], toward: FloatArray) -> NDArray[np.bool_]:
+    """Mask (n,) of the points (n, 3) on the organs' surfaces that a distant camera sees, which is in the direction
+    `toward` (3,): those with nothing of the organs before them (a depth buffer, Catmull 1974)."""
+    surface, _ = SurfaceSampler(SCREEN_POINTS, 0).draw(organs)
+    view = np.linalg.svd(toward[np.newaxis])[2]
+    view[0] = toward / np.linalg.norm(toward)
+    both = np.concatenate([surface, points]) @ view.T
+    cell = np.floor(both[:, 1:] / PIXEL_CM).astype(np.int64)
+    cell -= cell.min(axis=0)
+    pixel = cell[:, 0] * (cell[:, 1].max() + 1) + cell[:, 1]
+    nearest = np.full(pixel.max() + 1, -np.inf)
+    np.maximum.at(nearest, pixel, both[:, 0])
+    seen: NDArray[np.bool_] = both[len(surface) :, 0] >= nearest[pixel[len(surface) :]] - BEHIND_CM
+    return seen
 
 
 def occlude(points: FloatArray, diameter_cm: float, random: np.random.Generator) -> NDArray[np.bool_]:

@@ -32,6 +32,7 @@ UNITS = {  # written, and as results have it: factor and unit
     "deg": (1.0, "deg"), "degree": (1.0, "deg"), "degrees": (1.0, "deg"), "°": (1.0, "deg"),
     "rad": (180.0 / np.pi, "deg"), "deg/cm": (1.0, "deg/cm"), "rel": (1.0, "rel"),
 }  # fmt: skip
+PAIR_COLUMNS = ["cloud", "trait", "unit", "measured", "value", "low", "high", "flags"]
 LIMITS = 1.96  # standard deviations of the differences to either side of their mean (Bland and Altman, 1986)
 FAR_OFF, LEAST_FOR_OUTLIERS = 3.5, 5  # of the modified z-score (Iglewicz and Hoaglin, 1993); pairs
 
@@ -146,9 +147,8 @@ def compare(measures: pd.DataFrame, results: pd.DataFrame) -> Comparison:
         shown = [result[key] for key in ("value", "low", "high", "flags")]
         pairs.append((cloud, row["trait"], row["unit"], row["value"], *shown))
     lone += [f"result, not measured: {cloud}" for cloud in results["cloud"].unique() if cloud not in named.values()]
-    columns = ["cloud", "trait", "unit", "measured", "value", "low", "high", "flags"]
-    table = pd.DataFrame(pairs, columns=columns)
-    return Comparison(table.astype(dict.fromkeys(columns[3:7], float)), tuple(dict.fromkeys(lone)))
+    table = pd.DataFrame(pairs, columns=PAIR_COLUMNS)
+    return Comparison(table.astype(dict.fromkeys(PAIR_COLUMNS[3:7], float)), tuple(dict.fromkeys(lone)))
 
 
 def agreement(pairs: pd.DataFrame) -> list[Agreement]:

@@ -1,17 +1,31 @@
-"""The command line: parse, call, print, exit code (0 all measured; 1 some inputs failed; 2 nothing could be done)."""
+"""The commands that measure one phytomer a cloud, and those that make such clouds: fit, simulate, demo, recipe."""
 
 import json
-import sys
 import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
 import pandas as pd
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from phytofit.cli.console import (
+    NoiseOption,
+    NoiseReachOption,
+    OutliersOption,
+    OutOption,
+    Seed,
+    SpeciesOption,
+    SphereDiameterOption,
+    SpheresOption,
+    ViewsOption,
+    app,
+    complain,
+    err,
+    or_exit,
+    out,
+)
 from phytofit.cloud import PointCloud
 from phytofit.distances import DISTANCES
 from phytofit.errors import PhytofitError, SettingError
@@ -20,38 +34,19 @@ from phytofit.formats import read_cloud, write_cloud
 from phytofit.optimize import Generation
 from phytofit.preparation import AXES, parse_up
 from phytofit.recipe import defaults, recipe
-from phytofit.report import agreement_page, agreement_table
 from phytofit.results import prepare_folder, result_names, save_fit, table_text, trait_table, write_text
 from phytofit.simulation import SimulatedPhytomer, simulate
-from phytofit.species import Species, load_species, species_names
+from phytofit.species import Species, load_species
 from phytofit.traits import Trait, measure
-from phytofit.validation import agreement, compare, read_measures, read_results
 
-__all__ = ["app", "main"]
+__all__ = ["demo_command", "fit_command", "recipe_command", "simulate_command"]
 
-app = typer.Typer(
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="markdown",
-    help="Plant traits from 3D point clouds, by fitting parametric plant models.\n\n"
-    "Start with `phytofit demo`; then `phytofit fit leaf.ply --units cm`.",
-)
-out = Console()
-err = Console(stderr=True)
 FIT = defaults(fit)
 SIMULATE = defaults(simulate)
-SHOWN = ("n", "bias", "RMSE", "R", "CCC", "covered", "flagged")  # of an agreement, on the screen
 
 
 def _by_method(setting: str) -> str:
     return ", ".join(f"{defaults(function)[setting]} for {name}" for name, function in METHODS.items())
-
-
-Seed = Annotated[int, typer.Option(help="The same seed gives the same result.", min=0)]
-SpeciesOption = Annotated[
-    str, typer.Option(help=f"A species that comes with phytofit ({', '.join(species_names())}), or a TOML file.")
-]
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.", file_okay=True)]
 
 
 @app.command("fit")
@@ -117,10 +112,10 @@ def fit_command(
 
         phytofit fit crowded.ply --units cm --seed-point 12.5,-3,40
     """
-    seed_points = _or_exit(lambda: _seed_points(seed_point or [], len(clouds)))
-    chosen = _or_exit(lambda: load_species(species))
-    _or_exit(lambda: prepare_folder(folder))
-    _or_exit(lambda: parse_up(up))
+    seed_points = or_exit(lambda: _seed_points(seed_point or [], len(clouds)))
+    chosen = or_exit(lambda: load_species(species))
+    or_exit(lambda: prepare_folder(folder))
+    or_exit(lambda: parse_up(up))
     settings: dict[str, Any] = {
         "species": chosen,
         "up": up,
@@ -142,15 +137,15 @@ def fit_command(
             result = _fit_with_progress(cloud, name, settings)
             where = save_fit(result, cloud, folder, name)
         except SettingError as error:  # as wrong for every other cloud
-            _complain(error)
+            complain(error)
             raise typer.Exit(2) from None
         except PhytofitError as error:
-            _complain(error if str(path) in str(error) or path.name in str(error) else f"{path}: {error}")
+            complain(error if str(path) in str(error) or path.name in str(error) else f"{path}: {error}")
             continue
         tables.append(trait_table(name, result.traits))
         _print_fit(result, name, where)
     if tables:
-        _or_exit(lambda: write_text(folder / "traits.csv", table_text(pd.concat(tables))))
+        or_exit(lambda: write_text(folder / "traits.csv", table_text(pd.concat(tables))))
         out.print(f"{len(tables)} of {len(clouds)} clouds measured: {folder / 'traits.csv'}", highlight=False)
     raise typer.Exit(0 if len(tables) == len(clouds) else 1 if tables else 2)
 
@@ -177,10 +172,12 @@ def simulate_command(
         typer.Option("--set", help="NAME=VALUE fixes a parameter that is else drawn from the species' range."),
     ] = None,
     points: Annotated[int, typer.Option(help="Points on each, before spheres are removed.")] = SIMULATE["n_points"],
-    noise: Annotated[float, typer.Option(help="Gaussian noise a coordinate, cm.")] = SIMULATE["noise_cm"],
-    spheres: Annotated[int, typer.Option(help="Spheres removed from each.")] = SIMULATE["n_spheres"],
-    sphere_diameter: Annotated[float, typer.Option(help="Their diameter, cm.")] = SIMULATE["sphere_diameter_cm"],
-    outliers: Annotated[float, typer.Option(help="Share of outliers added.")] = SIMULATE["outlier_share"],
+    noise: NoiseOption = SIMULATE["noise_cm"],
+    noise_reach: NoiseReachOption = SIMULATE["noise_reach_cm"],
+    views: ViewsOption = SIMULATE["n_views"],
+    spheres: SpheresOption = SIMULATE["n_spheres"],
+    sphere_diameter: SphereDiameterOption = SIMULATE["sphere_diameter_cm"],
+    outliers: OutliersOption = SIMULATE["outlier_share"],
     upright: Annotated[
         bool, typer.Option("--upright", help="Stem along +z, leaf towards +x; else a random pose.")
     ] = False,
@@ -194,17 +191,19 @@ def simulate_command(
 
         phytofit simulate --number 10 --noise 0.5 --spheres 1 --set leaf_length=60 --out simulated
     """
-    chosen = _or_exit(lambda: load_species(species))
-    fixed = _or_exit(lambda: _parse_parameters(parameters or [], chosen))
-    _or_exit(lambda: prepare_folder(folder))
+    chosen = or_exit(lambda: load_species(species))
+    fixed = or_exit(lambda: _parse_parameters(parameters or [], chosen))
+    or_exit(lambda: prepare_folder(folder))
     tables = []
     for i in range(number):
-        made = _or_exit(
+        made = or_exit(
             lambda i=i: simulate(
                 chosen,
                 fixed=fixed,
                 n_points=points,
                 noise_cm=noise,
+                noise_reach_cm=noise_reach,
+                n_views=views,
                 n_spheres=spheres,
                 sphere_diameter_cm=sphere_diameter,
                 outlier_share=outliers,
@@ -213,9 +212,9 @@ def simulate_command(
             )
         )
         name = f"phytomer_{i + 1:04d}"
-        _or_exit(lambda made=made, name=name: _write_simulated(made, chosen, folder, name))
+        or_exit(lambda made=made, name=name: _write_simulated(made, chosen, folder, name))
         tables.append(trait_table(name, measure(made.organs, method="truth")))
-    _or_exit(lambda: write_text(folder / "truth.csv", table_text(pd.concat(tables))))
+    or_exit(lambda: write_text(folder / "truth.csv", table_text(pd.concat(tables))))
     out.print(f"{number} phytomers in {folder}, their true traits in {folder / 'truth.csv'}", highlight=False)
 
 
@@ -225,19 +224,19 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
 
     Needs no data and no screen; the picture to look at is DIR/phytomer_0001/fit.png.
     """
-    _or_exit(lambda: prepare_folder(folder))
+    or_exit(lambda: prepare_folder(folder))
     species = load_species()
     made = simulate(species, n_spheres=2, seed=seed)
     cloud_file = folder / "phytomer_0001.ply"
-    _or_exit(lambda: _write_simulated(made, species, folder, "phytomer_0001", labels=False))
+    or_exit(lambda: _write_simulated(made, species, folder, "phytomer_0001", labels=False))
     out.print(
         f"Simulated a phytomer: {len(made.points)} points, 0.5 cm noise, two 6 cm spheres cut out, "
         f"random pose.\nMeasuring it: phytofit fit {cloud_file} --units cm --out {folder}",
         highlight=False,
     )
-    cloud = _or_exit(lambda: read_cloud(cloud_file, "cm"))
-    result = _or_exit(lambda: _fit_with_progress(cloud, cloud.name, {"species": species, "seed": seed}))
-    where = _or_exit(lambda: save_fit(result, cloud, folder))
+    cloud = or_exit(lambda: read_cloud(cloud_file, "cm"))
+    result = or_exit(lambda: _fit_with_progress(cloud, cloud.name, {"species": species, "seed": seed}))
+    where = or_exit(lambda: save_fit(result, cloud, folder))
     table = Table(title="Estimate beside truth")
     for column in ("trait", "estimate", "95 % interval", "truth", "unit"):
         table.add_column(column, justify="left" if column in ("trait", "unit") else "right")
@@ -246,53 +245,6 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
     out.print(table)
     _print_remarks(result)
     out.print(f"The model on the points: {where / 'fit.png'}", highlight=False)
-
-
-@app.command("validate")
-def validate_command(
-    results: Annotated[Path, typer.Argument(help="Folder of results of `phytofit fit`, or its traits.csv.")],
-    truth: Annotated[
-        Path,
-        typer.Option(help="CSV of hand measures: a row a cloud, columns such as leaf_length_cm, 'Leaf angle (deg)'."),
-    ],
-    folder: OutOption = Path("validation"),
-) -> None:
-    """Compare results with hand measures: bias, errors, correlation, concordance, limits of agreement, coverage.
-
-    Prints a table and writes DIR/validation.html (the same with plots, in one file), DIR/validation.csv (the
-    statistics) and DIR/pairs.csv (each cloud and trait that both have).
-
-    Example:
-
-        phytofit validate results --truth measurements.csv
-    """
-    measures = _or_exit(lambda: read_measures(truth))
-    comparison = _or_exit(lambda: compare(measures, read_results(results)))
-    found = agreement(comparison.pairs)
-    for text in comparison.unmatched:
-        out.print(f"note: {text}", highlight=False)
-    if not found:
-        _complain(
-            f"{truth}: none of its clouds and traits is among those of {results}; are the clouds' names the same?"
-        )
-        raise typer.Exit(2)
-    _or_exit(lambda: prepare_folder(folder))
-    shown = agreement_table(found)
-    table = Table(title=f"{results} against {truth.name}")
-    for column in ("trait", *SHOWN):
-        table.add_column(column, justify="left" if column == "trait" else "right", no_wrap=True)
-    for name, row in zip(shown.index, shown[list(SHOWN)].to_numpy(), strict=True):
-        table.add_row(str(name), *row)
-    page = agreement_page(comparison, found, f"Results in {results.name} against {truth.name}")
-    statistics = pd.DataFrame(found).assign(outliers=["; ".join(a.outliers) for a in found])
-    _or_exit(lambda: write_text(folder / "pairs.csv", table_text(comparison.pairs)))
-    _or_exit(lambda: write_text(folder / "validation.csv", table_text(statistics)))
-    _or_exit(lambda: write_text(folder / "validation.html", page))
-    out.print(table)
-    for a in found:
-        if a.outliers:
-            out.print(f"note: {a.trait} is far off in {', '.join(a.outliers)}", highlight=False)
-    out.print(f"With plots: {folder / 'validation.html'}", highlight=False)
 
 
 @app.command("recipe")
@@ -376,25 +328,3 @@ def _write_simulated(
         "units": "cm, deg",
     }
     write_text(folder / f"{name}.json", json.dumps(truth, indent=1) + "\n")
-
-
-def _complain(error: Exception | str) -> None:
-    err.print(f"[bold red]error:[/] {' '.join(str(error).split())}", highlight=False, soft_wrap=True)
-
-
-def _or_exit(call: Any) -> Any:
-    """What the call returns; or one line and exit code 2."""
-    try:
-        return call()
-    except PhytofitError as error:
-        _complain(error)
-        raise typer.Exit(2) from None
-
-
-def main() -> None:
-    """Entry point of the ``phytofit`` command."""
-    try:
-        app()
-    except KeyboardInterrupt:
-        err.print("stopped; results that were finished are kept")
-        sys.exit(130)

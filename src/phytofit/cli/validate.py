@@ -1,0 +1,209 @@
+"""The command that says how good results are: against hand measures, or in a simulation of the user's sensor."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import pandas as pd
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from phytofit.cli.console import (
+    NoiseOption,
+    NoiseReachOption,
+    OutliersOption,
+    OutOption,
+    Seed,
+    SpeciesOption,
+    SphereDiameterOption,
+    SpheresOption,
+    ViewsOption,
+    app,
+    complain,
+    err,
+    or_exit,
+    out,
+)
+from phytofit.fitting import fit
+from phytofit.recipe import defaults
+from phytofit.report import agreement_page, agreement_table, trial_page
+from phytofit.results import prepare_folder, table_text, write_text
+from phytofit.simulation import simulate
+from phytofit.species import Species, load_species
+from phytofit.trials import N_POINTS, N_VIEWS, Trial, needed, trial, trial_table, vary
+from phytofit.validation import Agreement, agreement, compare, read_measures, read_results
+
+__all__ = ["validate_command"]
+
+SHOWN = ("n", "bias", "RMSE", "R", "CCC", "covered")  # of an agreement, on the screen
+SIMULATE = defaults(simulate)
+SPECIES = defaults(fit)["species"]
+
+
+@app.command("validate")
+def validate_command(
+    results: Annotated[
+        Path | None, typer.Argument(help="Folder of results of `phytofit fit`, or its traits.csv.", show_default=False)
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option(help="CSV of hand measures: a row a cloud, columns such as leaf_length_cm, 'Leaf angle (deg)'."),
+    ] = None,
+    simulated: Annotated[
+        bool, typer.Option("--simulate", help="No results: simulated phytomers, seen by a sensor such as yours.")
+    ] = False,
+    points: Annotated[int, typer.Option(help="Points your sensor gives of a phytomer.")] = SIMULATE["n_points"],
+    noise: NoiseOption = SIMULATE["noise_cm"],
+    noise_reach: NoiseReachOption = SIMULATE["noise_reach_cm"],
+    views: ViewsOption = SIMULATE["n_views"],
+    spheres: SpheresOption = SIMULATE["n_spheres"],
+    sphere_diameter: SphereDiameterOption = SIMULATE["sphere_diameter_cm"],
+    outliers: OutliersOption = SIMULATE["outlier_share"],
+    number: Annotated[int, typer.Option("--number", "-n", help="How many phytomers a step.", min=3)] = 30,
+    within: Annotated[float, typer.Option(help="How near the truth lengths should be, %.", min=0.0)] = 5.0,
+    within_deg: Annotated[float, typer.Option(help="How near the truth the leaf angle should be, degrees.")] = 3.0,
+    species: SpeciesOption = SPECIES,
+    seed: Seed = SIMULATE["seed"],
+    threads: Annotated[int | None, typer.Option(help="Threads to work with; all cores by default.")] = None,
+    folder: OutOption = Path("validation"),
+) -> None:
+    """How good are the numbers: against your ruler, or in a simulation of your sensor.
+
+    With --truth: results beside hand measures; bias, errors, correlation, concordance, limits of agreement, coverage.
+    With --simulate: phytomers drawn from the species' ranges, scanned with your noise, points, cameras and occlusion,
+    and fitted; the same numbers, and how many points and how many cameras you need.
+
+    Prints a table and writes DIR/validation.html (the same with plots, in one file), DIR/validation.csv (the
+    statistics) and DIR/pairs.csv (each cloud and trait); with --simulate also DIR/needs.csv.
+
+    Examples:
+
+        phytofit validate results --truth measurements.csv
+
+        phytofit validate --simulate --noise 0.3 --points 2000 --views 3 --spheres 1
+    """
+    if simulated in (truth is not None, results is not None):
+        complain(
+            "expected a folder of results with --truth measurements.csv, or --simulate without either: "
+            "see phytofit validate --help"
+        )
+        raise typer.Exit(2)
+    if results is not None and truth is not None:
+        _against_the_hand(results, truth, folder)
+        return
+    sensor: dict[str, Any] = {
+        "n_points": points,
+        "noise_cm": noise,
+        "noise_reach_cm": noise_reach,
+        "n_views": views,
+        "n_spheres": spheres,
+        "sphere_diameter_cm": sphere_diameter,
+        "outlier_share": outliers,
+    }
+    chosen = or_exit(lambda: load_species(species))
+    or_exit(lambda: simulate(chosen, seed=seed, **sensor))  # tells what is wrong with a setting
+    or_exit(lambda: prepare_folder(folder))
+    trials = _tried(sensor, chosen, number, seed, threads)
+    base = trials["the sensor"][0]
+    if base.comparison.pairs.empty:
+        complain(f"none of the {number} simulated clouds could be fitted: {base.comparison.unmatched[0]}")
+        raise typer.Exit(2)
+    _tell(base, {name: made for name, made in trials.items() if name != "the sensor"}, within, within_deg, folder)
+
+
+def _against_the_hand(results: Path, truth: Path, folder: Path) -> None:
+    measures = or_exit(lambda: read_measures(truth))
+    comparison = or_exit(lambda: compare(measures, read_results(results)))
+    found = agreement(comparison.pairs)
+    for text in comparison.unmatched:
+        out.print(f"note: {text}", highlight=False)
+    if not found:
+        complain(f"{truth}: none of its clouds and traits is among those of {results}; are the clouds' names the same?")
+        raise typer.Exit(2)
+    or_exit(lambda: prepare_folder(folder))
+    page = agreement_page(comparison, found, f"Results in {results.name} against {truth.name}")
+    _write(folder, comparison.pairs, found, page)
+    _show(found, f"{results} against {truth.name}")
+    for a in found:
+        if a.outliers:
+            out.print(f"note: {a.trait} is far off in {', '.join(a.outliers)}", highlight=False)
+    out.print(f"With plots: {folder / 'validation.html'}", highlight=False)
+
+
+def _tried(
+    sensor: Mapping[str, Any], species: Species, number: int, seed: int, threads: int | None
+) -> dict[str, dict[int, Trial]]:
+    """The sensor as it was described (under 0), and with other numbers of points and of cameras."""
+    steps = {
+        "n_points": sorted({*N_POINTS, sensor["n_points"]}),
+        "n_views": sorted({*N_VIEWS, *((sensor["n_views"],) if sensor["n_views"] else ())}),
+    }
+    runs = 1 + sum(value != sensor[name] for name, values in steps.items() for value in values)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, TimeRemainingColumn(), console=err, transient=True, disable=not err.is_terminal) as bar:
+        task = bar.add_task("simulated phytomers", total=runs * number)
+
+        def done() -> None:
+            bar.advance(task)
+
+        base = trial(sensor, species, number=number, seed=seed, threads=threads, progress=done)
+        if base.comparison.pairs.empty:
+            return {"the sensor": {0: base}}
+        return {
+            "the sensor": {0: base},
+            "points": vary(base, "n_points", steps["n_points"], species, seed=seed, threads=threads, progress=done),
+            "cameras": vary(base, "n_views", steps["n_views"], species, seed=seed, threads=threads, progress=done),
+        }
+
+
+def _tell(base: Trial, trials: Mapping[str, Mapping[int, Trial]], percent: float, degrees: float, folder: Path) -> None:
+    found = agreement(base.comparison.pairs)
+    needs = pd.concat([trial_table(name, made, percent, degrees) for name, made in trials.items()])
+    answers = []
+    for name, made in trials.items():
+        for trait, (least, most) in needed(made, percent, degrees).items():
+            near = f"{degrees:g}°" if "angle" in trait else f"{percent:g} %"
+            said = f"{trait.replace('_', ' ')} within {near} of the truth in nine of ten: "
+            if least is not None:
+                answers.append(f"{said}with {least:,} {name if least > 1 else name[:-1]} or more")
+            else:
+                answers.append(f"{said}not with up to {max(made):,} {name} (at best in {100 * most:.0f} %)")
+    title = f"{base.n} simulated phytomers, {_described(base.sensor)}"
+    _write(folder, base.comparison.pairs, found, trial_page(base, needs, answers, percent, degrees, title))
+    or_exit(lambda: write_text(folder / "needs.csv", table_text(needs)))
+    _show(found, title)
+    for text in (*base.comparison.unmatched, *answers):
+        out.print(text, highlight=False)
+    out.print(f"With plots: {folder / 'validation.html'}", highlight=False)
+
+
+def _described(sensor: Mapping[str, Any]) -> str:
+    parts = [f"{sensor['n_points']:,} points", f"{sensor['noise_cm']:g} cm noise"]
+    if sensor["noise_reach_cm"]:
+        parts[-1] += f" shared over {sensor['noise_reach_cm']:g} cm"
+    parts.append("seen from everywhere" if sensor["n_views"] is None else f"{sensor['n_views']} cameras")
+    if sensor["n_spheres"]:
+        parts.append(f"{sensor['n_spheres']} x sphere of {sensor['sphere_diameter_cm']:g} cm removed")
+    if sensor["outlier_share"]:
+        parts.append(f"{100 * sensor['outlier_share']:g} % outliers")
+    return ", ".join(parts)
+
+
+def _write(folder: Path, pairs: pd.DataFrame, found: Sequence[Agreement], page: str) -> None:
+    statistics = pd.DataFrame(found).assign(outliers=["; ".join(a.outliers) for a in found])
+    or_exit(lambda: write_text(folder / "pairs.csv", table_text(pairs)))
+    or_exit(lambda: write_text(folder / "validation.csv", table_text(statistics)))
+    or_exit(lambda: write_text(folder / "validation.html", page))
+
+
+def _show(found: Sequence[Agreement], title: str) -> None:
+    shown = agreement_table(found)
+    table = Table(title=title, box=SIMPLE_HEAD, pad_edge=False)
+    for column in ("trait", *SHOWN):
+        table.add_column(column, justify="left" if column == "trait" else "right", no_wrap=True)
+    for name, row in zip(shown.index, shown[list(SHOWN)].to_numpy(), strict=True):
+        table.add_row(str(name), *row)
+    out.print(table)
+    out.print(f"{max(a.flagged for a in found)} of {max(a.n for a in found)} results flagged", highlight=False)

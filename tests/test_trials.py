@@ -1,0 +1,102 @@
+"""How good it would be with a sensor: the same numbers as by hand, and answers that follow from them."""
+
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+import phytofit
+from phytofit.cli import app
+from phytofit.trials import MAIN_TRAITS, Trial, needed, share_within, trial, trial_table, vary
+from phytofit.validation import PAIR_COLUMNS, Comparison
+
+POSED = 1e-9  # a phytomer has the same traits in every pose, but for rounding
+SENSOR = {"n_points": 400, "noise_cm": 0.2}
+
+
+@pytest.fixture(scope="module")
+def base():
+    return trial(SENSOR, number=3, seed=4)
+
+
+def made_up(offsets, n=None, trait="leaf_length", unit="cm"):
+    """A trial of truths of 100 whose results are off by so much."""
+    rows = [(f"p{i}", trait, unit, 100.0, 100.0 + off, 90.0, 110.0, "") for i, off in enumerate(offsets)]
+    table = pd.DataFrame(rows, columns=PAIR_COLUMNS)
+    return Trial(Comparison(table, ()), len(offsets) if n is None else n, {})
+
+
+def test_pairs_are_the_truth_and_the_fit_of_the_same_cloud(base):
+    pairs = base.comparison.pairs
+    made = phytofit.simulate(seed=5, **SENSOR)
+    result = phytofit.fit(made.points, "cm")
+    mine = pairs[pairs["cloud"] == "phytomer_0002"]
+    assert mine["measured"].tolist() == [t.value for t in phytofit.measure(made.organs)]
+    assert mine["value"].tolist() == [t.value for t in result.traits]
+    assert set(pairs["cloud"]) == {f"phytomer_000{i}" for i in (1, 2, 3)}
+
+
+def test_the_same_phytomers_are_scanned_at_every_step_and_the_base_is_not_done_again(base):
+    called = []
+    made = vary(base, "n_points", (200, 400), seed=4, progress=lambda: called.append(1))
+    assert made[400] is base
+    assert len(called) == 3
+    pairs, others = base.comparison.pairs, made[200].comparison.pairs
+    assert others["cloud"].tolist() == pairs["cloud"].tolist()
+    assert others["measured"].tolist() == pytest.approx(pairs["measured"].tolist(), rel=POSED)
+    table = trial_table("points", made, 5.0, 3.0)
+    assert table.groupby(["value", "trait"]).ngroups == len(table) == 2 * len(MAIN_TRAITS)
+
+
+def test_lengths_count_by_per_cent_angles_by_degrees_and_refused_clouds_against():
+    assert share_within(made_up([0.0, 4.9, -4.9, 5.1]), 5.0, 1.0)["leaf_length"] == pytest.approx(0.75)
+    by_degrees = share_within(made_up([0.9, 1.1], trait="leaf_angle", unit="deg"), 50.0, 1.0)
+    assert by_degrees["leaf_angle"] == pytest.approx(0.5)
+    assert share_within(made_up([0.0], n=4), 5.0, 1.0)["leaf_length"] == pytest.approx(0.25)
+
+
+def test_enough_is_from_where_on_nine_of_ten_are_near():
+    good, bad = made_up([0.0] * 10), made_up([0.0] * 8 + [9.0, 9.0])
+    assert needed({3: good, 1: bad, 2: good}, 5.0, 3.0)["leaf_length"] == (2, 1.0)
+    assert needed({1: good, 2: bad, 3: good}, 5.0, 3.0)["leaf_length"] == (3, 1.0)
+    assert needed({1: bad, 2: bad}, 5.0, 3.0)["leaf_length"] == (None, 0.8)
+
+
+def test_a_cloud_that_can_not_be_fitted_is_counted_and_named():
+    none = trial({"n_points": 120, "noise_cm": 8.0}, number=3, seed=1)
+    assert len(none.comparison.unmatched) + none.comparison.pairs["cloud"].nunique() == 3
+
+
+@pytest.mark.long
+def test_the_command_answers(tmp_path):
+    arguments = ["validate", "--simulate", "-n", "3", "--points", "600", "--noise", "0.2", "--views", "2"]
+    done = CliRunner().invoke(app, [*arguments, "--out", str(tmp_path / "v")])
+    assert done.exit_code == 0, done.output
+    said = " ".join(done.output.split())
+    assert "600 points, 0.2 cm noise, 2 cameras" in said
+    for trait in MAIN_TRAITS:
+        assert said.count(f"{trait.replace('_', ' ')} within") == 2  # points and cameras
+    needs = pd.read_csv(tmp_path / "v" / "needs.csv")
+    assert set(needs[needs["setting"] == "points"]["value"]) == {300, 600, 1000, 2500, 5000}
+    assert set(needs[needs["setting"] == "cameras"]["value"]) == {1, 2, 3, 6}
+    page = (tmp_path / "v" / "validation.html").read_text(encoding="utf-8")
+    assert page.count("data:image/png;base64,") == 9
+    assert "by hand" not in page
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "expected a folder of results with --truth"),
+        (["results"], "expected a folder of results with --truth"),
+        (["results", "--simulate"], "expected a folder of results with --truth"),
+        (["--simulate", "--truth", "t.csv"], "expected a folder of results with --truth"),
+        (["--simulate", "--noise", "-1"], "noise: expected a number of 0 or more"),
+        (["--simulate", "--views", "0"], "views: expected a number of 1 or more"),
+        (["--simulate", "--species", "nowhere.toml"], "nowhere.toml"),
+    ],
+)
+def test_the_command_says_what_is_wrong(tmp_path, arguments, said):
+    done = CliRunner().invoke(app, ["validate", *arguments, "--out", str(tmp_path / "v")])
+    assert done.exit_code == 2
+    assert said in " ".join(done.output.split())
+    assert not (tmp_path / "v").exists()
