@@ -7,7 +7,7 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thread
 
-from evaluation import ablations, figure6, figure7, figure8, table1, table2
+from evaluation import ablations, figure6, figure7, figure8, jobs, table1, table2
 from evaluation.jobs import console
 from evaluation.pages import fill
 from evaluation.settings import FULL, QUICK, Budget
@@ -35,12 +35,14 @@ def main() -> None:
     parser.add_argument(
         "--out", type=Path, default=RESULTS, help="another folder than evaluation/results; no page changes"
     )
+    parser.add_argument("--kept", type=Path, default=jobs.KEPT, help="folder of what is done, to go on from")
     arguments = parser.parse_args()
     unknown = [part for part in arguments.parts if part not in PARTS]
     if unknown:
         parser.error(f"no part is called {', '.join(unknown)}; there are {', '.join(PARTS)}")
     if arguments.quick and arguments.out == RESULTS:
         parser.error("--quick needs --out: its numbers mean nothing, and must not stand on a page")
+    jobs.KEPT = arguments.kept
     arguments.out.mkdir(parents=True, exist_ok=True)
     budget = FULL if arguments.full else QUICK if arguments.quick else Budget()
     began = time.perf_counter()

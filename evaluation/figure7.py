@@ -18,6 +18,7 @@ WAYS = {"noise": "0.5 cm noise added", "sphere": "a sphere of 6 cm removed"}
 NOISE_CM, SPHERE_CM = 0.5, 6.0
 TIP_CM = SPHERE_CM / 2.0 + 1.0  # a sphere nearer to the tip than this may have taken something of it
 POISSON_DEPTH = 8  # of the octree: cells of a two hundredth of the cloud's size
+OPEN3D = "pip install 'phytofit[peers]', and on Debian apt-get install libusb-1.0-0 libgl1 libx11-6"
 UNTOUCHED = "untouched"
 SIMULATED = {  # the comparison where the truth is known: noise, cm, and spheres removed
     "0.05 cm noise": (0.05, 0),
@@ -175,7 +176,7 @@ def poisson(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, int, int] | Non
     try:
         import open3d  # noqa: PLC0415  an extra, and without a wheel for some versions of Python
     except (ImportError, OSError) as error:
-        console.print(f"Fig. 7 (c) is left out ({error}): pip install 'phytofit[paper]'", highlight=False)
+        console.print(f"Fig. 7 (c) is left out ({error}): {OPEN3D}", highlight=False, soft_wrap=True)
         return None
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(20))

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 import phytofit
 
-KEPT = Path(__file__).parent / ".kept"
+KEPT = Path(__file__).parent / ".kept"  # what jobs returned, by state of the code
 SOURCES = (Path(phytofit.__file__).parent, Path(__file__).parent, Path(__file__).parents[1] / "benchmarks")
 LIBRARIES = ("numpy", "scipy", "numba")
 COLUMNS = (
@@ -35,22 +35,21 @@ def state_of_the_code() -> str:
     return found.hexdigest()[:12]
 
 
-def kept(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, which does for the same arguments nothing twice, not even in another run."""
-    done: Callable[..., Any] = Memory(KEPT / state_of_the_code(), verbose=0).cache(function)
-    return done
-
-
 def run_all(
     function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], title: str, *, one_by_one: bool = False
 ) -> list[Any]:
-    """What the function returns for each job, in their order; on all cores unless one by one, as where time counts."""
+    """What the function returns for each job, in their order; on all cores unless one by one, as where time counts.
+
+    A job that this state of the code has done before, even in another run, is not done again.
+    """
+    kept = Memory(KEPT / state_of_the_code(), verbose=0).cache(function)
+    before = sum(kept.check_call_in_cache(*job) for job in jobs)
     work = Parallel(n_jobs=1 if one_by_one else -1, return_as="generator", batch_size=1)
     results = []
     with Progress(*COLUMNS, console=console, transient=True, disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task(title, total=len(jobs))
-        for result in work(delayed(kept(function))(*job) for job in jobs):
+        for result in work(delayed(kept)(*job) for job in jobs):
             results.append(result)
             bar.advance(task)
-    console.print(f"{title}: {len(jobs)} jobs done", highlight=False)
+    console.print(f"{title}: {len(jobs)} jobs" + (f", {before} of them done before" if before else ""), highlight=False)
     return results

@@ -1,0 +1,115 @@
+"""The evaluation runs, goes on where it was stopped, and its tables stand on the pages as they were written."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+from evaluation import jobs, pages, tables  # noqa: E402  of the repository, not installed
+
+RESULTS = ROOT / "evaluation" / "results"
+TABLES = ("table1", "table2", "methods", "ablations")
+FROM_DATA = ("real", "real_means", "fig7")
+PICTURES = ("fig6a", "fig6b", "fig7abc", "fig7d", "fig8")
+
+
+def command(out, *arguments):
+    return [sys.executable, "-m", "evaluation", "--quick", "--out", out, "--kept", out / "kept", *arguments]
+
+
+def run(out, *arguments):
+    done = subprocess.run(command(out, *arguments), cwd=ROOT, capture_output=True, text=True, timeout=900, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_table_one_runs_and_is_not_done_twice(tmp_path):
+    said = run(tmp_path, "table1")
+    assert "done before" not in said
+    first = (tmp_path / "table1.csv").read_bytes()
+    assert "2 of them done before" in run(tmp_path, "table1")
+    assert (tmp_path / "table1.csv").read_bytes() == first
+    assert "| 20 | 300 |" in (tmp_path / "table1.md").read_text(encoding="utf-8")
+
+
+def test_another_state_of_the_code_keeps_apart(tmp_path, monkeypatch):
+    (tmp_path / "a.py").write_text("x = 1\n")
+    monkeypatch.setattr(jobs, "SOURCES", (tmp_path,))
+    before = jobs.state_of_the_code()
+    assert jobs.state_of_the_code() == before
+    (tmp_path / "a.py").write_text("x = 2\n")
+    assert jobs.state_of_the_code() != before
+
+
+@pytest.mark.parametrize("arguments", [["--quick"], ["nothing", "--out", "x"]])
+def test_what_can_not_be_is_refused(arguments):
+    done = subprocess.run(
+        [sys.executable, "-m", "evaluation", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
+    assert "error:" in done.stderr
+
+
+def test_the_interval_of_a_correlation_is_the_bootstraps():
+    """SciPy's percentile bootstrap of the same pairs; both draw at random."""
+    random = np.random.default_rng(3)
+    x = random.normal(size=40)
+    y = x + random.normal(size=40)
+    mine = tables.interval_of_r(x, y[np.newaxis], draws=9000)
+    theirs = stats.bootstrap(
+        (x, y), lambda a, b: stats.pearsonr(a, b)[0], paired=True, method="percentile", n_resamples=9000, rng=1,
+        vectorized=False,
+    ).confidence_interval  # fmt: skip
+    assert mine == pytest.approx(theirs, abs=0.02)
+    assert tables.interval_of_r(x, np.stack([y, y])) == tables.interval_of_r(x, y[np.newaxis])
+
+
+def test_marked_places_are_filled_and_nothing_else(tmp_path):
+    (tmp_path / "one.md").write_text("| 1 |\n")
+    (tmp_path / "two.md").write_text("two\n")
+    text = "a\n<!-- one -->\nold\n<!-- end -->\nb\n<!-- two -->\n<!-- end -->\nc <!-- else -->\n"
+    once = pages.filled(text, tmp_path)
+    assert once == "a\n<!-- one -->\n| 1 |\n<!-- end -->\nb\n<!-- two -->\ntwo\n<!-- end -->\nc <!-- else -->\n"
+    assert pages.filled(once, tmp_path) == once
+
+
+@pytest.mark.parametrize("page", pages.PAGES, ids=lambda page: page.name)
+def test_pages_show_the_tables_as_they_were_written(page):
+    text = page.read_text(encoding="utf-8")
+    assert pages.filled(text, RESULTS) == text
+    assert re.search(r"<!-- table2 -->\n\| .*\n(\|.*\n)+<!-- end -->", text)
+
+
+@pytest.mark.long
+def test_the_whole_runs_and_goes_on_where_it_was_killed(tmp_path):
+    """What was killed in the middle and started again leaves the same tables as what ran through; times aside."""
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    run(whole)
+    process = subprocess.Popen(command(killed), cwd=ROOT, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    for line in process.stdout:
+        if line.startswith("fig6 done"):
+            break
+    time.sleep(2.0)  # into Table II
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    process.stdout.close()
+    assert "done before" in run(killed)
+    names = [*TABLES, *(FROM_DATA if (whole / "real.md").exists() else ())]
+    for name in names:
+        mine, theirs = ((folder / f"{name}.md").read_text(encoding="utf-8") for folder in (killed, whole))
+        assert mine.count("\n") > 2
+        assert name == "table1" or mine == theirs
+    for name in PICTURES:
+        if (whole / f"{name}.png").exists():
+            assert (killed / f"{name}.png").read_bytes() == (whole / f"{name}.png").read_bytes()
+    assert (whole / "fig8.png").exists()
