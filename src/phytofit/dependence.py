@@ -26,6 +26,8 @@ LONGEST_CM = 10.0
 MIDDLES_CM: FloatArray = LAG_CM * (np.arange(round(LONGEST_CM / LAG_CM), dtype=np.float64) + 0.5)
 REACHES_CM = np.geomspace(0.2, 6.0, 30)
 CLEAR, CLEAR_OF_ORGAN = 4.0, 3.0  # standard errors by which a correlation must differ from none: of all, of an organ
+N_EXPECTED = 300  # points for which it is computed what a fit leaves of their errors
+HEIGHTS = np.linspace(0.05, 1.0, 20)
 CELL = 0.5  # of the reach: points within such a cell count as one place
 N_PIECES, LEAST_ON_PIECE = 15, 40  # of the leaf, whose width is compared with the model's; points
 CUT = 2.5  # reaches at which the correlation counts as none
@@ -82,7 +84,7 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
         errors[one] -= errors[one].mean() if one.any() else 0.0  # noise moves points off a tube on average
     # places on the surface: points that are near each other in space have been moved alike, by selection
     place = likelihood.points - distance[:, np.newaxis] * frame[:, :, 2]
-    bells = [NONE, NONE]
+    bells, both = [NONE, NONE], NONE
     if known is not None:
         bells = [known.stem, known.leaf]
     elif (both := _correlation(place[sure], errors[sure])) != NONE:
@@ -91,6 +93,10 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
         return Dependence(independent, 1.0, float(len(scores)), NONE, NONE)
 
     changes = [_change_of_scores(likelihood, state, frame[:, :, a], std[:, a]) for a in range(3)]
+    if known is None:
+        information = independent + np.diag(likelihood.precision + 1e-9)
+        whole = _before_the_fit(place[sure], errors[sure], [change[sure] for change in changes], information)
+        bells = [Bell(whole.correlation * bell.correlation / both.correlation, whole.reach_cm) for bell in bells]
     variability, alike = independent.copy(), 0.0
     for organ, bell in zip(organs_of, bells, strict=True):
         if bell == NONE:
@@ -131,10 +137,11 @@ def _change_of_scores(likelihood: CloudLikelihood, state: State, direction: Floa
     return (there - back) / (2.0 * SHIFT)
 
 
-def width_misfit(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> float:
+def width_misfit(likelihood: CloudLikelihood, state: State, scores: FloatArray, bell: Bell) -> float:
     """Standard deviation of the leaf's width about the model's, place by place, as a share of it, beyond chance.
 
-    Points that are uniform across a strip vary by a third of its half width squared, and by the noise.
+    Points that are uniform across a strip vary by a third of its half width squared, and by the noise, which neighbours
+    share as the `bell` says.
     """
     on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2] > 0.5
     leaf = likelihood.model.organs(state.x)[1].row(0)
@@ -152,7 +159,10 @@ def width_misfit(likelihood: CloudLikelihood, state: State, scores: FloatArray) 
             continue
         wide = np.mean(half[those] ** 2) / 3.0
         ratio.append(np.sqrt(max(0.0, np.mean(lateral[those] ** 2) - state.noise[1] ** 2) / wide))
-        chance.append(0.2 / n * (1.0 + state.noise[1] ** 2 / wide) ** 2)
+        noise = state.noise[1] ** 2 / wide
+        area = 2.0 * np.mean(half[those]) * lengths.sum() / N_PIECES
+        patches = np.clip(area / max(2.0 * np.pi * bell.reach_cm**2, 1e-9), 1.0, n)  # whose noise is its own
+        chance.append(0.2 / n * (1.0 + noise) ** 2 + bell.correlation * noise * (1.0 + 0.25 * noise) / patches)
     if len(ratio) < 3:
         return 0.0
     spread = 1.4826 * np.median(np.abs(ratio - np.median(ratio)))  # a hole that is not known of is no misfit
@@ -214,6 +224,48 @@ def _correlation(points: FloatArray, errors: FloatArray) -> Bell:
         height, error, misfit = products.height(reach)
         if height > CLEAR * error and misfit < best:
             best, found = misfit, Bell(min(height, 1.0), reach)
+    return found
+
+
+def _before_the_fit(
+    points: FloatArray, errors: FloatArray, changes: Sequence[FloatArray], information: FloatArray
+) -> Bell:
+    """The bell of the errors (n,) as they were before a fit took a part of them up, the more of those that reach far.
+
+    What is left of errors with covariance C after a fit is (I - H) C (I - H)'.  H, which says how the fit follows the
+    errors, is known from the scores' `changes` (n, k) by errors in three directions, the last across the surface, and
+    the `information` (k, k).  So for each bell it can be told what products of neighbours' errors would be left, and
+    the bell is taken for which these are nearest to those that are found.
+    """
+    products = _Products.of(points, errors)
+    some = np.unique(np.linspace(0, len(points) - 1, N_EXPECTED).astype(int))
+    each = len(points) / len(some)  # of which each stands for so many
+    moved = [change[some] for change in changes]
+    follow = np.linalg.solve(information, moved[2].T)  # (k, m): how the fit follows an error, and takes it up elsewhere
+    gap = np.linalg.norm(points[some, np.newaxis] - points[some], axis=2)
+    lag = (gap / LAG_CM).astype(int)
+    pair = ~np.eye(len(some), dtype=bool) & (lag < len(MIDDLES_CM))
+    count = np.bincount(lag[pair], minlength=len(MIDDLES_CM))
+    taken = moved[2] @ follow
+
+    def by_lag(left: FloatArray) -> FloatArray:
+        return np.bincount(lag[pair], left[pair], minlength=len(MIDDLES_CM)) / np.maximum(count, 1)
+
+    weight = np.where(count > 0, products.pairs, 0.0)
+    white, white_at_none = -by_lag(taken), 1.0 - float(np.mean(np.diag(taken)))
+    best, found = np.inf, NONE
+    for reach in REACHES_CM.tolist():
+        alike = np.exp(-0.5 * (gap / reach) ** 2)
+        once = each * (moved[2] @ np.linalg.solve(information, moved[2].T @ alike))
+        sums = each**2 * sum(change.T @ alike @ change for change in moved)
+        left = alike - once - once.T + follow.T @ sums @ follow
+        shared, shared_at_none = by_lag(left), float(np.mean(np.diag(left)))
+        for correlation in HEIGHTS.tolist():
+            at_none = correlation * shared_at_none + (1.0 - correlation) * white_at_none
+            expected = (correlation * shared + (1.0 - correlation) * white) / at_none
+            misfit = float(weight @ (products.mean - expected) ** 2)
+            if misfit < best:
+                best, found = misfit, Bell(correlation, reach)
     return found
 
 

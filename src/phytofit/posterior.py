@@ -391,7 +391,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         evidence=chosen.evidence,
         inflation=dependence.inflation,
         misfit_cm=float(np.sqrt(dependence.leaf.correlation) * np.hypot(*state.noise[1:])),
-        width_misfit=width_misfit(likelihood, state, at.scores),
+        width_misfit=width_misfit(likelihood, state, at.scores, dependence.leaf),
         correlated_cm=dependence.leaf.reach_cm,
         rival=chosen.rival,
         quantile=float(stdtrit(left, 0.975)),
