@@ -256,7 +256,7 @@ def absorbed(seed, reach_cm, n=900):
 def test_the_part_of_the_errors_that_a_fit_took_up_is_told(reach_cm):
     scenes = [absorbed(seed, reach_cm) for seed in range(8)]
     as_left = np.mean([_correlation(places, left).reach_cm for places, left, _, _ in scenes])
-    found = np.median([_before_the_fit(*scene) for scene in scenes], axis=0)
+    found = np.median([_before_the_fit(*scene, as_left) for scene in scenes], axis=0)
     assert as_left < 0.9 * reach_cm  # what is left reaches less far
     assert found == pytest.approx([1.0, reach_cm], rel=0.2)
 

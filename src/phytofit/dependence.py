@@ -27,6 +27,7 @@ MIDDLES_CM: FloatArray = LAG_CM * (np.arange(round(LONGEST_CM / LAG_CM), dtype=n
 REACHES_CM = np.geomspace(0.2, 6.0, 30)
 CLEAR, CLEAR_OF_ORGAN = 4.0, 3.0  # standard errors by which a correlation must differ from none: of all, of an organ
 N_EXPECTED = 300  # points for which it is computed what a fit leaves of their errors
+FARTHER = 1.5  # times: a misfit of the model, which no fit took up, would else be taken for errors without end
 HEIGHTS = np.linspace(0.05, 1.0, 20)
 CELL = 0.5  # of the reach: points within such a cell count as one place
 N_PIECES, LEAST_ON_PIECE = 15, 40  # of the leaf, whose width is compared with the model's; points
@@ -95,7 +96,9 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
     changes = [_change_of_scores(likelihood, state, frame[:, :, a], std[:, a]) for a in range(3)]
     if known is None:
         information = independent + np.diag(likelihood.precision + 1e-9)
-        whole = _before_the_fit(place[sure], errors[sure], [change[sure] for change in changes], information)
+        whole = _before_the_fit(
+            place[sure], errors[sure], [change[sure] for change in changes], information, both.reach_cm
+        )
         bells = [Bell(whole.correlation * bell.correlation / both.correlation, whole.reach_cm) for bell in bells]
     variability, alike = independent.copy(), 0.0
     for organ, bell in zip(organs_of, bells, strict=True):
@@ -228,7 +231,7 @@ def _correlation(points: FloatArray, errors: FloatArray) -> Bell:
 
 
 def _before_the_fit(
-    points: FloatArray, errors: FloatArray, changes: Sequence[FloatArray], information: FloatArray
+    points: FloatArray, errors: FloatArray, changes: Sequence[FloatArray], information: FloatArray, left_cm: float
 ) -> Bell:
     """The bell of the errors (n,) as they were before a fit took a part of them up, the more of those that reach far.
 
@@ -254,7 +257,7 @@ def _before_the_fit(
     weight = np.where(count > 0, products.pairs, 0.0)
     white, white_at_none = -by_lag(taken), 1.0 - float(np.mean(np.diag(taken)))
     best, found = np.inf, NONE
-    for reach in REACHES_CM.tolist():
+    for reach in REACHES_CM[FARTHER * left_cm >= REACHES_CM].tolist():
         alike = np.exp(-0.5 * (gap / reach) ** 2)
         once = each * (moved[2] @ np.linalg.solve(information, moved[2].T @ alike))
         sums = each**2 * sum(change.T @ alike @ change for change in moved)
