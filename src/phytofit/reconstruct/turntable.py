@@ -1,0 +1,225 @@
+"""A turntable in front of a fixed camera: what turns, its axis, and the angle of each view, from the data."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from phytofit.errors import InputError
+
+__all__ = ["Turn", "find_turn", "moving_pixels", "scene_without_plant", "turn_model", "turn_poses"]
+
+FloatArray = NDArray[np.float64]
+CELL_CM = 1.0  # of the distance fields that the search looks up
+FAR_CM = 5.0  # distances beyond count as this: half hidden views have nothing near
+GAPS = (1, 2, 3)  # views apart, whose agreement the search sums
+UP_TILTS = np.radians(np.arange(-20.0, 81.0, 10.0))  # how far the camera looks down that is tried
+STEPS_DEG = np.arange(6.0, 121.0, 3.0)  # that are tried where no step is given
+BEST_KEPT = 12  # starts of the search that are refined
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """An axis in the camera's frame, cm: ``up`` (3,), ``point`` (3,); and the ``angles`` (n,) of the views, rad."""
+
+    up: FloatArray
+    point: FloatArray
+    angles: FloatArray
+
+
+def scene_without_plant(depths: FloatArray, *, far_share: float = 0.75) -> FloatArray:
+    """What stands still behind the plant: the depth (height, width) that each pixel shows where nothing is in front.
+
+    That is the `far_share` quantile of what came back over the views (n, height, width), since a plant that turns
+    leaves most pixels free in most views; infinite where less than a third of the views saw anything.
+    """
+    n_seen = (depths > 0).sum(axis=0)
+    ordered = np.sort(np.where(depths > 0, depths, np.inf), axis=0)
+    rank = np.floor(far_share * np.maximum(n_seen - 1, 0)).astype(int)
+    scene = np.take_along_axis(ordered, rank[None], axis=0)[0]
+    return np.where(3 * n_seen >= len(depths), scene, np.inf)
+
+
+def moving_pixels(
+    depth: FloatArray, scene: FloatArray, *, least_cm: float = 2.0, noise_share: float = 0.01
+) -> NDArray[np.bool_]:
+    """Pixels (height, width) that lie in front of the still scene by more than `least_cm` and a share of the depth."""
+    return (depth > 0) & (depth < scene - least_cm - noise_share * np.where(np.isfinite(scene), scene, 0.0))
+
+
+class _Field:
+    """Distances to a view's points, cm, looked up in a grid."""
+
+    def __init__(self, points: FloatArray, low: FloatArray, shape: Sequence[int]) -> None:
+        grid = np.ones(shape, bool)
+        cells = np.floor((points - low) / CELL_CM).astype(int)
+        cells = cells[((cells >= 0) & (cells < shape)).all(axis=1)]
+        grid[tuple(cells.T)] = False
+        self.low, self.shape = low, np.array(shape)
+        distance = ndimage.distance_transform_edt(grid) * CELL_CM
+        self.distance = np.minimum(distance, FAR_CM).astype(np.float32)
+
+    def rough(self, points: FloatArray) -> float:
+        cells = np.floor((points - self.low) / CELL_CM).astype(int)
+        inside = ((cells >= 0) & (cells < self.shape)).all(axis=1)
+        total = float(self.distance[tuple(cells[inside].T)].sum()) + FAR_CM * int((~inside).sum())
+        return total / len(points)
+
+    def smooth(self, points: FloatArray) -> float:
+        places = (points - self.low) / CELL_CM - 0.5
+        found = ndimage.map_coordinates(self.distance, places.T, order=1, mode="constant", cval=FAR_CM)
+        return float(found.mean())
+
+
+def _turned(points: FloatArray, up: FloatArray, point: FloatArray, angle: float) -> FloatArray:
+    R = Rotation.from_rotvec(angle * up).as_matrix()
+    return (points - point) @ R.T + point
+
+
+def _axis(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Up and a point of the axis for tilt, roll and the point: x (5,)."""
+    up = np.array([np.sin(x[1]), -np.cos(x[0]) * np.cos(x[1]), -np.sin(x[0]) * np.cos(x[1])])
+    return up, x[2:5]
+
+
+def find_turn(
+    clouds: Sequence[FloatArray],
+    *,
+    step_deg: float | None = None,
+    tolerance: float = 0.35,
+    n_samples: int = 400,
+    told: Callable[[str], None] = lambda _: None,
+) -> Turn:
+    """The axis and the angles of views of something that turns by about the same step between each two.
+
+    Tried are axes that are tilted as a camera looks down, at several depths, with every step either way; the best are
+    refined, on how near the turned points of a view are to those of the next ones.  Then each view's own step
+    is measured: one that is doubled turned by 0, one that is missing leaves a step of two.
+
+    Parameters
+    ----------
+    clouds
+        (m, 3) of each of n views, cm, in the camera's frame, y down: what turns.
+    step_deg
+        The nominal step; the true one is sought within a share `tolerance` of it, either way.
+    n_samples
+        Points of each view that are compared.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than 3 views.
+    """
+    if len(clouds) < 3:
+        raise InputError(f"found {len(clouds)} views with a plant, expected at least 3 of a turntable")
+    samples = [c[np.unique(np.linspace(0, len(c) - 1, min(n_samples, len(c))).astype(int))] for c in clouds]
+    together = np.concatenate(samples)
+    centre = np.median(together, axis=0)
+    reach = float(np.quantile(np.linalg.norm(together - centre, axis=1), 0.99)) + 2 * FAR_CM
+    low = centre - reach
+    fields = [_Field(c, low, (int(2 * reach / CELL_CM) + 1,) * 3) for c in clouds]
+
+    def cost(x: FloatArray, gaps: Sequence[int], look: str) -> float:
+        (up, point), total, n = _axis(x), 0.0, 0
+        for gap in gaps:
+            R = Rotation.from_rotvec(gap * x[5] * up).as_matrix()
+            for i in range(len(samples) - gap):
+                total += getattr(fields[i + gap], look)((samples[i] - point) @ R.T + point)
+                n += 1
+        return total / n
+
+    told("axis and step")
+    tries = STEPS_DEG if step_deg is None else step_deg * np.linspace(1 - tolerance, 1 + tolerance, 15)
+    steps = np.radians(np.concatenate([tries, -tries]))
+    offsets = reach * np.linspace(-0.1, 0.3, 5)  # of the axis behind what is seen, which faces the camera
+    starts = []
+    for tilt in UP_TILTS:
+        for offset in offsets:
+            point = centre + [0.0, 0.0, offset]
+            for step in steps:
+                x = np.array([tilt, 0.0, *point, step])
+                starts.append((cost(x, (1,), "rough"), len(starts), x))
+    starts.sort(key=lambda start: start[:2])
+    gaps = [gap for gap in GAPS if gap < len(clouds)]
+    found = []
+    for _, _, x in _apart(starts):
+        simplex = np.concatenate([[x], x + np.diag([0.1, 0.1, 2.0, 0.0, 2.0, 0.05])[[0, 1, 2, 4, 5]]])
+        found.append(_descend(lambda x: cost(x, gaps, "smooth"), x, simplex))
+    best = min(found, key=lambda pair: pair[0])[1]
+    up, point = _axis(best)
+    told("angles")
+    return Turn(up, point, _angles(samples, fields, up, point, float(best[5])))
+
+
+def _apart(starts: Sequence[tuple[float, int, FloatArray]]) -> list[tuple[float, int, FloatArray]]:
+    """The best starts whose steps and tilts differ: of each hill one, as far as can be told."""
+    kept: list[tuple[float, int, FloatArray]] = []
+    for start in starts:
+        if all(abs(start[2][5] - k[2][5]) > np.radians(4) or abs(start[2][0] - k[2][0]) > np.radians(25) for k in kept):
+            kept.append(start)
+        if len(kept) == BEST_KEPT:
+            break
+    return kept
+
+
+def _descend(cost: Callable[[FloatArray], float], x: FloatArray, simplex: FloatArray) -> tuple[float, FloatArray]:
+    """Nelder and Mead's search over all but the height of the point, along which nothing changes."""
+    free = [0, 1, 2, 4, 5]
+
+    def part(y: FloatArray) -> float:
+        whole = x.copy()
+        whole[free] = y
+        return cost(whole)
+
+    options = {"initial_simplex": simplex[:, free], "maxfev": 220, "xatol": 1e-3, "fatol": 1e-3}
+    ended = minimize(part, x[free], method="Nelder-Mead", options=options)
+    whole = x.copy()
+    whole[free] = ended.x
+    return float(ended.fun), whole
+
+
+def _angles(
+    samples: Sequence[FloatArray], fields: Sequence[_Field], up: FloatArray, point: FloatArray, step: float
+) -> FloatArray:
+    """The angle of each view: the common step, unless none, two or three steps fit a pair clearly better."""
+
+    def cost(i: int, angle: float) -> float:
+        there = fields[i + 1].smooth(_turned(samples[i], up, point, angle))
+        back = fields[i].smooth(_turned(samples[i + 1], up, point, -angle))
+        return (there + back) / 2
+
+    turned = [0.0]
+    for i in range(len(samples) - 1):
+        tries = step * (np.array([0.0, 1.0, 2.0, 3.0])[:, None] + np.array([-0.1, 0.0, 0.1]))
+        costs = np.array([[cost(i, angle) for angle in row] for row in tries])
+        multiple = int(np.argmin(costs.min(axis=1)))
+        if costs[multiple].min() > 0.7 * costs[1].min():
+            multiple = 1
+        turned.append(turned[-1] + tries[multiple][np.argmin(costs[multiple])])
+    return np.array(turned)
+
+
+def turn_poses(turn: Turn) -> FloatArray:
+    """Poses (n, 4, 4), camera to the frame of the first view's camera, for the views of a turn."""
+    poses = np.tile(np.eye(4), (len(turn.angles), 1, 1))
+    for pose, angle in zip(poses, turn.angles, strict=True):
+        pose[:3, :3] = Rotation.from_rotvec(-angle * turn.up).as_matrix()
+        pose[:3, 3] = turn.point - pose[:3, :3] @ turn.point
+    return poses
+
+
+def turn_model(turn: Turn) -> tuple[Callable[[FloatArray], Turn], int]:
+    """Turns near this one, as a function of 4 + (n - 1) numbers: tilts (rad) and shifts (cm) of the axis across
+    itself, then changes of the angles (rad) after the first; and how many numbers that are."""
+    across = np.linalg.svd(turn.up[None])[2][1:]
+
+    def moved(x: FloatArray) -> Turn:
+        up = turn.up + x[:2] @ across
+        angles = turn.angles + np.concatenate([[0.0], x[4:]])
+        return Turn(up / np.linalg.norm(up), turn.point + x[2:4] @ across, angles)
+
+    return moved, 3 + len(turn.angles)
