@@ -16,9 +16,11 @@ MOST_LINES = 500
 LAYERS = [
     {"__init__", "__main__"},
     {"cli"},
+    {"cli_reconstruct"},
+    {"results_reconstruct"},
     {"results"},
     {"report", "viewer", "export"},
-    {"plots"},
+    {"plots", "plots_reconstruct"},
     {"validation"},
     {"batch"},
     {"pipeline"},

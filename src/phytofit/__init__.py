@@ -26,17 +26,22 @@ from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parameters import Parameter, ParameterSpace
 from phytofit.plots import plot_convergence, plot_fit
+from phytofit.plots_reconstruct import plot_reconstruction
 from phytofit.pose import StartPose, start_poses
 from phytofit.posterior import Estimate
 from phytofit.preparation import Prepared, prepare
 from phytofit.recipe import recipe
+from phytofit.reconstruct import CAMERAS, Camera, Reconstruction, load_camera, reconstruct
 from phytofit.results import save_fit, trait_table
+from phytofit.results_reconstruct import save_reconstruction
 from phytofit.simulation import SimulatedPhytomer, add_noise, add_outliers, occlude, simulate
 from phytofit.species import Species, load_species
 from phytofit.traits import Trait, measure
 
 __all__ = [
+    "CAMERAS",
     "DISTANCES",
+    "Camera",
     "CloudError",
     "CloudLikelihood",
     "CrossEntropy",
@@ -54,6 +59,7 @@ __all__ = [
     "Phytomer",
     "PointCloud",
     "Prepared",
+    "Reconstruction",
     "Reference",
     "Registration",
     "SettingError",
@@ -69,6 +75,7 @@ __all__ = [
     "add_outliers",
     "fit",
     "from_points",
+    "load_camera",
     "load_species",
     "measure",
     "mesh",
@@ -77,11 +84,14 @@ __all__ = [
     "occlude",
     "plot_convergence",
     "plot_fit",
+    "plot_reconstruction",
     "prepare",
     "read_cloud",
     "recipe",
+    "reconstruct",
     "remove_outliers",
     "save_fit",
+    "save_reconstruction",
     "simulate",
     "start_poses",
     "thin",

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from phytofit import cli_reconstruct
 from phytofit.cloud import PointCloud
 from phytofit.distances import DISTANCES
 from phytofit.errors import PhytofitError, SettingError
@@ -389,6 +390,9 @@ def _or_exit(call: Any) -> Any:
     except PhytofitError as error:
         _complain(error)
         raise typer.Exit(2) from None
+
+
+cli_reconstruct.register(app)
 
 
 def main() -> None:

@@ -143,11 +143,12 @@ def load_camera(name: str) -> Camera:
     missing, unknown = [key for key in NEEDED if key not in given], sorted(set(given) - known)
     if missing or unknown:
         wrong = [f"{key} is missing" for key in missing] + [f"{key} is unknown" for key in unknown]
-        raise SettingError(f"{path}: {', '.join(wrong)}; expected {' '.join(NEEDED)}, and maybe depth_scale unit distortion")
+        expected = f"{' '.join(NEEDED)}, and maybe depth_scale unit distortion"
+        raise SettingError(f"{path}: {', '.join(wrong)}; expected {expected}")
     try:
         return Camera(
-            **{key: float(given[key]) for key in ("fx", "fy", "cx", "cy")},
-            **{key: int(given[key]) for key in ("width", "height")},
+            *(float(given[key]) for key in NEEDED[:4]),
+            *(int(given[key]) for key in NEEDED[4:]),
             depth_scale=float(given.get("depth_scale", 1.0)),
             unit=str(given.get("unit", "mm")),
             distortion=tuple(float(k) for k in given.get("distortion", ())),

@@ -16,7 +16,14 @@ from phytofit.reconstruct.fusion import fuse
 from phytofit.reconstruct.placing import Placed, Rejected, Views, place_by_poses, place_on_turntable
 from phytofit.reconstruct.registration import Pair, move_points
 from phytofit.reconstruct.turntable import Turn
-from phytofit.reconstruct.views import DepthView, depth_files, drop_flying_pixels, read_views, surface_normals, view_points
+from phytofit.reconstruct.views import (
+    DepthView,
+    depth_files,
+    drop_flying_pixels,
+    read_views,
+    surface_normals,
+    view_points,
+)
 
 __all__ = ["Reconstruction", "read_poses", "reconstruct"]
 
@@ -47,6 +54,11 @@ class Reconstruction:
     rejected: tuple[Rejected, ...]
     flags: tuple[str, ...]
     settings: dict[str, Any]
+
+    @property
+    def residual_cm(self) -> float:
+        """The median distance between the surfaces of views that overlap, cm; not a number for one view."""
+        return float(np.nanmedian([pair.residual_cm for pair in self.pairs])) if self.pairs else float("nan")
 
 
 def reconstruct(
@@ -126,7 +138,8 @@ def read_poses(path: Path, files: Sequence[str]) -> dict[str, FloatArray]:
         raise InputError(f"{path}: can't be read ({error.strerror}); expected a JSON file of poses") from None
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f'{path}: not a file of poses ({error!r}); expected {{"unit": "cm", "views": [{{"file": ..., "pose": 4x4}}]}}'
+            f"{path}: not a file of poses ({error!r}); expected "
+            '{"unit": "cm", "views": [{"file": ..., "pose": 4x4}]}'
         ) from None
     for name in files:
         if name not in read:
@@ -171,7 +184,9 @@ def _fused(
         distances.append(seen[:, 2])
     n_points = sum(map(len, points))
     if n_points < MIN_POINTS:
-        raise InputError(f"{folder}: found {n_points} points of a plant, expected at least {MIN_POINTS}; is it in view?")
+        raise InputError(
+            f"{folder}: found {n_points} points of a plant, expected at least {MIN_POINTS}; is it in view?"
+        )
     spacing = spacing_cm or float(np.clip(camera.pitch(float(np.median(np.concatenate(distances)))), 0.05, 1.0))
     fused = fuse(
         np.concatenate(points),

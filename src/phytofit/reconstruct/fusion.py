@@ -57,7 +57,9 @@ def fuse(
     points, normals, view = points[keep], normals[keep], view[keep]
     keep = remove_outliers(points)
     points, normals, view = points[keep], normals[keep], view[keep]
-    distance, index = cKDTree(points).query(points, k=min(N_NEIGHBORS, len(points)), distance_upper_bound=reach * spacing_cm)
+    distance, index = cKDTree(points).query(
+        points, k=min(N_NEIGHBORS, len(points)), distance_upper_bound=reach * spacing_cm
+    )
     near = np.isfinite(distance)
     index = np.where(near, index, np.arange(len(points))[:, None])
     near &= np.einsum("nkc,nc->nk", normals[index], normals) >= SAME_SIDE

@@ -27,8 +27,6 @@ DRIFT_CM, DRIFT_RAD = 0.3, 0.005  # how far views may stray from the turntable o
 NOISE_CM, ALIKE = 0.2, 20.0  # of matched points; and how many neighbours count as one, as their errors are alike
 
 
-
-
 @dataclass(frozen=True)
 class Rejected:
     """A view that was left out, and why."""
@@ -77,8 +75,8 @@ def place_on_turntable(views: Views, camera: Camera, step_deg: float | None, tol
     masks = _showing_plant(views, masks, "nothing turns in front of what stands still")
     if len(views.files) < 3:
         raise InputError(
-            f"no plant in view: in {len(views.files)} of {len(views.files) + len(views.rejected)} views something turns "
-            "in front of a still background, expected at least 3; does the camera stand still, are these all views?"
+            f"no plant in view: in {len(views.files)} of {len(views.files) + len(views.rejected)} views something "
+            "turns in front of a still background, expected at least 3; does the camera stand still, are these all views?"
         )
     _judge_frame(views, masks)
     clouds = [view_points(d, rays, m) for d, m in zip(views.depths, masks, strict=True)]
@@ -113,7 +111,13 @@ def place_on_turntable(views: Views, camera: Camera, step_deg: float | None, tol
         whole = np.zeros_like(mask)
         whole[seen] = plant
         full.append(whole)
-    if not support:
+    if support:
+        crumbs = support.crumbs(np.concatenate([
+            move_points(p, view_points(d, rays, m)) for p, d, m in zip(poses, views.depths, full, strict=True)
+        ]))  # fmt: skip
+        for mask, part in zip(full, np.split(crumbs, np.cumsum([m.sum() for m in full])[:-1]), strict=True):
+            mask[mask] = ~part
+    else:
         views.flags.append("no pot was found; if there is one, it is still in the cloud")
     drop = np.eye(4)
     drop[2, 3] = -ground
@@ -148,8 +152,8 @@ def _judge_frame(views: Views, masks: Sequence[Mask]) -> None:
     shares = [float(mask.mean()) for mask in masks]
     if np.median(shares) > FULL_FRAME:
         raise InputError(
-            f"{views.files[0]} and the others: the plant fills the frame ({100 * float(np.median(shares)):.0f} % of the "
-            f"pixels), expected less than {100 * FULL_FRAME:.0f} %; move the camera back"
+            f"{views.files[0]} and the others: the plant fills the frame ({100 * float(np.median(shares)):.0f} % of "
+            f"the pixels), expected less than {100 * FULL_FRAME:.0f} %; move the camera back"
         )
     edges = [int(sum(e.sum() for e in (m[:2].any(0), m[-2:].any(0), m[:, :2].any(1), m[:, -2:].any(1)))) for m in masks]
     cut = [file for file, n in zip(views.files, edges, strict=True) if n >= 3]
@@ -182,9 +186,7 @@ def _relaxed_turn(clouds: Sequence[FloatArray], turn: Turn) -> tuple[Turn, Float
     return turn, poses, pairs, _fitting(_overlaps(pairs, len(clouds)))
 
 
-def place_by_poses(
-    views: Views, given: dict[str, FloatArray], camera: Camera, told: Callable[[str], None]
-) -> Placed:
+def place_by_poses(views: Views, given: dict[str, FloatArray], camera: Camera, told: Callable[[str], None]) -> Placed:
     """Views at known poses (camera to world, cm, z up), relaxed a little so that they fit each other.
 
     The plant is what is near the place that the cameras look at, without what stands round about it below.
@@ -312,8 +314,8 @@ def _believe(pairs: Sequence[Pair], camera: Camera) -> None:
     residual = float(np.nanmedian([pair.residual_cm for pair in pairs]))
     if overlap < LEAST_OVERLAP or residual > MOST_RESIDUAL_CM:
         raise InputError(
-            f"the views don't fit each other: neighbours overlap by {100 * overlap:.0f} % with {residual:.2f} cm between "
-            f"them, expected at least {100 * LEAST_OVERLAP:.0f} % and at most {MOST_RESIDUAL_CM:g} cm; is --camera "
+            f"the views don't fit each other: neighbours overlap by {100 * overlap:.0f} % with {residual:.2f} cm "
+            f"between them, expected at least {100 * LEAST_OVERLAP:.0f} % and at most {MOST_RESIDUAL_CM:g} cm; is --camera "
             f"({camera.name}, f = {camera.fx:g} pixels) right, are the views in order and steps not above 60°?"
         )
 
@@ -325,9 +327,11 @@ def _step(turn: Turn, views: Views) -> float:
     for i, turned in enumerate(steps):
         a, b = views.files[i : i + 2]
         if abs(turned) < 0.4 * abs(step):
-            views.flags.append(f"{b} was taken {abs(turned):.1f}° after {a}: a doubled view? the step is {abs(step):.1f}°")
+            views.flags.append(f"{b}: turned {abs(turned):.1f}° from {a}, the step is {abs(step):.1f}°; taken twice?")
         elif abs(turned) > 1.6 * abs(step):
-            views.flags.append(f"between {a} and {b} the plant turned {abs(turned):.1f}°: a missing view? the step is {abs(step):.1f}°")
+            views.flags.append(
+                f"{b}: turned {abs(turned):.1f}° from {a}, the step is {abs(step):.1f}°; is a view missing between them?"
+            )
     covered = float(np.ptp(np.degrees(turn.angles)))
     if covered + 2.0 * abs(step) < 360.0:
         views.flags.append(f"the views cover {covered:.0f}° of the turn; the far side was not seen")

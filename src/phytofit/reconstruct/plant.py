@@ -10,7 +10,7 @@ from scipy import ndimage
 from phytofit.reconstruct.cameras import Camera
 from phytofit.reconstruct.registration import move_points
 
-__all__ = ["Support", "cylinder", "find_support", "largest_body", "seen_through"]
+__all__ = ["CORE_CM", "Support", "bodies", "cylinder", "find_support", "largest_body", "seen_through"]
 
 FloatArray = NDArray[np.float64]
 CORE_CM = 5.0  # nearer to the axis a stem may stand still while the plant turns
@@ -23,26 +23,31 @@ def largest_body(
 
     Connected are cells of `cell_cm` that touch and hold at least `least_in_cell` points of all clouds together.
     """
-    together = np.concatenate(clouds)
-    if not len(together):
-        return [np.zeros(0, bool) for _ in clouds]
-    cells, cell, count = np.unique(np.floor(together / cell_cm).astype(int), axis=0, return_inverse=True, return_counts=True)
-    cell = cell.ravel()
+    body = bodies(np.concatenate([np.zeros((0, 3)), *clouds]), cell_cm=cell_cm, least_in_cell=least_in_cell)
+    return np.split(body == 0, np.cumsum([len(c) for c in clouds])[:-1])
+
+
+def bodies(points: FloatArray, *, cell_cm: float, least_in_cell: int = 1) -> NDArray[np.intp]:
+    """The connected body (n,) that each of the points (n, 3), cm, belongs to: 0 for the one of most points, then 1, …;
+    -1 in cells of fewer than `least_in_cell`."""
+    if not len(points):
+        return np.zeros(0, np.intp)
+    cells, cell, count = np.unique(
+        np.floor(points / cell_cm).astype(int), axis=0, return_inverse=True, return_counts=True
+    )
     full = np.flatnonzero(count >= least_in_cell)
-    mask = np.zeros(len(together), bool)
+    body = np.full(len(cells), -1)
     if len(full):
-        low = cells[full].min(axis=0)
-        # Cells that are far apart are brought nearer, since what lies between is empty anyway
-        places = [np.cumsum(np.minimum(np.diff(np.unique(c), prepend=c.min()), 2))[np.unique(c, return_inverse=True)[1]]
-                  for c in (cells[full] - low).T]  # fmt: skip
-        grid = np.zeros([p.max() + 1 for p in places], bool)
+        places = []
+        for places_along in cells[full].T:  # what lies between cells that are far apart is empty, and left out
+            known, index = np.unique(places_along, return_inverse=True)
+            places.append(np.cumsum(np.minimum(np.diff(known, prepend=known[0]), 2))[index.ravel()])
+        grid = np.zeros([place.max() + 1 for place in places], bool)
         grid[tuple(places)] = True
-        label = ndimage.label(grid, np.ones((3, 3, 3)))[0][tuple(places)]
-        best = np.argmax(np.bincount(label, weights=count[full]))
-        in_best = np.zeros(len(cells), bool)
-        in_best[full[label == best]] = True
-        mask = in_best[cell]
-    return np.split(mask, np.cumsum([len(c) for c in clouds])[:-1])
+        label = ndimage.label(grid, np.ones((3, 3, 3)))[0][tuple(places)] - 1
+        rank = np.argsort(np.argsort(-np.bincount(label, weights=count[full]), kind="stable"))
+        body[full] = rank[label]
+    return np.asarray(body[cell.ravel()])
 
 
 def cylinder(points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -71,7 +76,17 @@ class Support:
         r, _, z = cylinder(points)
         wide = ndimage.maximum_filter1d(self.radii, 2 * int(np.ceil(margin_cm / self.slice_cm)) + 1, mode="nearest")
         level = np.floor((z - self.bottom) / self.slice_cm).astype(int).clip(0, len(wide) - 1)
-        return (z < self.top + margin_cm) & (r < wide[level] + margin_cm)
+        return np.asarray((z < self.top + margin_cm) & (r < wide[level] + margin_cm))
+
+    def crumbs(self, points: FloatArray, *, cell_cm: float = 1.0, above_cm: float = 4.0) -> NDArray[np.bool_]:
+        """Which points (n, 3) of a plant are pieces of the support that :meth:`covers` left, of a pot that leans or is
+        not in the middle: bodies apart from the largest that lie by its rim, up to `above_cm` over it."""
+        r, _, z = cylinder(points)
+        body = bodies(points, cell_cm=cell_cm, least_in_cell=3) + 1  # 0: strays
+        at_rim = (z < self.top + above_cm) & (r < self.radii.max() + above_cm)
+        share = np.bincount(body, weights=at_rim, minlength=2) / np.maximum(np.bincount(body, minlength=2), 1)
+        share[:2] = 1.0, 0.0
+        return np.asarray(at_rim & (share > 0.9)[body])
 
 
 def find_support(

@@ -68,7 +68,9 @@ def register(
     stiffness: FloatArray | None = None,
     reaches_cm: Sequence[float] = REACHES_CM,
 ) -> FloatArray:
-    """Parameters (k,) of the poses that bring the surfaces of all pairs together: damped Gauss-Newton on point-to-plane distances.
+    """Parameters (k,) of the poses that bring the surfaces of all pairs together.
+
+    Damped Gauss-Newton on point-to-plane distances, matches anew each round.
 
     Parameters
     ----------
@@ -88,7 +90,9 @@ def register(
     """
     x = np.zeros(n_parameters)
     stiff = np.zeros(n_parameters) if stiffness is None else stiffness
-    centre = np.mean([move_points(p, s.points.mean(axis=0)[None])[0] for p, s in zip(poses, surfaces, strict=True)], axis=0)
+    centre = np.mean(
+        [move_points(p, s.points.mean(axis=0)[None])[0] for p, s in zip(poses, surfaces, strict=True)], axis=0
+    )
     size = max(float(np.linalg.norm(np.ptp(s.points, axis=0))) for s in surfaces)
     for reach in reaches_cm:
         for _ in range(ROUNDS):
@@ -142,7 +146,9 @@ def _matches(
     return move_points(poses[j], x), move_points(poses[j], y), normal @ R.T, np.sum((x - y) * normal, axis=1)
 
 
-def _jacobian(model: Callable[[FloatArray], FloatArray], x: FloatArray, now: FloatArray, centre: FloatArray) -> FloatArray:
+def _jacobian(
+    model: Callable[[FloatArray], FloatArray], x: FloatArray, now: FloatArray, centre: FloatArray
+) -> FloatArray:
     """(6n, k): twists about the centre that a parameter's change makes, by small steps."""
     step = 1e-5
     back = np.linalg.inv(now)

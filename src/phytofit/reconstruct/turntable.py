@@ -19,7 +19,7 @@ FAR_CM = 5.0  # distances beyond count as this: half hidden views have nothing n
 GAPS = (1, 2, 3)  # views apart, whose agreement the search sums
 UP_TILTS = np.radians(np.arange(-20.0, 81.0, 10.0))  # how far the camera looks down that is tried
 STEPS_DEG = np.arange(6.0, 121.0, 3.0)  # that are tried where no step is given
-BEST_KEPT = 12  # starts of the search that are refined
+BEST_KEPT = 8  # starts of the search that are refined
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class _Field:
 
 def _turned(points: FloatArray, up: FloatArray, point: FloatArray, angle: float) -> FloatArray:
     R = Rotation.from_rotvec(angle * up).as_matrix()
-    return (points - point) @ R.T + point
+    return np.asarray((points - point) @ R.T + point)
 
 
 def _axis(x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -128,7 +128,8 @@ def find_turn(
         for gap in gaps:
             R = Rotation.from_rotvec(gap * x[5] * up).as_matrix()
             for i in range(len(samples) - gap):
-                total += getattr(fields[i + gap], look)((samples[i] - point) @ R.T + point)
+                points = samples[i][::3] if look == "rough" else samples[i]
+                total += getattr(fields[i + gap], look)((points - point) @ R.T + point)
                 n += 1
         return total / n
 
@@ -136,10 +137,10 @@ def find_turn(
     tries = STEPS_DEG if step_deg is None else step_deg * np.linspace(1 - tolerance, 1 + tolerance, 15)
     steps = np.radians(np.concatenate([tries, -tries]))
     offsets = reach * np.linspace(-0.1, 0.3, 5)  # of the axis behind what is seen, which faces the camera
-    starts = []
+    starts: list[tuple[float, int, FloatArray]] = []
     for tilt in UP_TILTS:
         for offset in offsets:
-            point = centre + [0.0, 0.0, offset]
+            point = centre + np.array([0.0, 0.0, offset])
             for step in steps:
                 x = np.array([tilt, 0.0, *point, step])
                 starts.append((cost(x, (1,), "rough"), len(starts), x))

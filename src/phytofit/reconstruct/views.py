@@ -85,7 +85,7 @@ def read_views(files: Sequence[Path], camera: Camera, *, unit: str | None = None
         with np.errstate(invalid="ignore", over="ignore"):
             depth = np.nan_to_num(image.astype(float), nan=0.0, posinf=0.0, neginf=0.0) * step_cm
         if (depth < 0).any():
-            raise InputError(f"{path.name}: found negative depths, expected 0 where nothing came back and else distances")
+            raise InputError(f"{path.name}: found negative depths, expected distances, and 0 where nothing came back")
         views.append(DepthView(path.name, depth))
     _check_range(views, unit or camera.unit)
     return views
@@ -102,7 +102,7 @@ def _stored(path: Path) -> NDArray[Any]:
                         f"{path.name}: found an image of 8 bits or colours ({opened.mode}), expected 16-bit depth; "
                         "export depth without scaling to grey levels, or choose files with --pattern 'Depth*.png'"
                     )
-                image = np.asarray(opened)
+                image = np.array(opened)
     except InputError:
         raise
     except (OSError, ValueError, EOFError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
@@ -112,7 +112,7 @@ def _stored(path: Path) -> NDArray[Any]:
             f"{path.name}: found an array of shape {image.shape} and type {image.dtype}, "
             "expected (height, width) of 16-bit whole numbers or floats"
         )
-    return image
+    return np.asarray(image)
 
 
 def _check_range(views: Sequence[DepthView], unit: str) -> None:
@@ -157,7 +157,9 @@ def view_points(depth: FloatArray, rays: FloatArray, mask: NDArray[np.bool_]) ->
     return np.column_stack([rays[mask] * z[:, None], z])
 
 
-def surface_normals(points: FloatArray, *, n_neighbors: int = 16, reach_cm: float = 1.5) -> tuple[FloatArray, FloatArray]:
+def surface_normals(
+    points: FloatArray, *, n_neighbors: int = 16, reach_cm: float = 1.5
+) -> tuple[FloatArray, FloatArray]:
     """Unit normals (n, 3) towards the camera at the origin, and how flat (n,) each point's surroundings are.
 
     A normal is the direction of least spread of the at most `n_neighbors` nearest points within `reach_cm`; flatness
