@@ -146,9 +146,14 @@ def load_camera(name: str) -> Camera:
         expected = f"{' '.join(NEEDED)}, and maybe depth_scale unit distortion"
         raise SettingError(f"{path}: {', '.join(wrong)}; expected {expected}")
     try:
+        fx, fy, cx, cy = (float(given[key]) for key in NEEDED[:4])
         return Camera(
-            *(float(given[key]) for key in NEEDED[:4]),
-            *(int(given[key]) for key in NEEDED[4:]),
+            fx,
+            fy,
+            cx,
+            cy,
+            int(given["width"]),
+            int(given["height"]),
             depth_scale=float(given.get("depth_scale", 1.0)),
             unit=str(given.get("unit", "mm")),
             distortion=tuple(float(k) for k in given.get("distortion", ())),

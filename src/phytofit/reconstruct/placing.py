@@ -76,7 +76,7 @@ def place_on_turntable(views: Views, camera: Camera, step_deg: float | None, tol
     if len(views.files) < 3:
         raise InputError(
             f"no plant in view: in {len(views.files)} of {len(views.files) + len(views.rejected)} views something "
-            "turns in front of a still background, expected at least 3; does the camera stand still, are these all views?"
+            "turns in front of a still background, expected at least 3; does the camera stand still?"
         )
     _judge_frame(views, masks)
     clouds = [view_points(d, rays, m) for d, m in zip(views.depths, masks, strict=True)]
@@ -315,8 +315,8 @@ def _believe(pairs: Sequence[Pair], camera: Camera) -> None:
     if overlap < LEAST_OVERLAP or residual > MOST_RESIDUAL_CM:
         raise InputError(
             f"the views don't fit each other: neighbours overlap by {100 * overlap:.0f} % with {residual:.2f} cm "
-            f"between them, expected at least {100 * LEAST_OVERLAP:.0f} % and at most {MOST_RESIDUAL_CM:g} cm; is --camera "
-            f"({camera.name}, f = {camera.fx:g} pixels) right, are the views in order and steps not above 60°?"
+            f"between them, expected at least {100 * LEAST_OVERLAP:.0f} % and at most {MOST_RESIDUAL_CM:g} cm; is "
+            f"--camera ({camera.name}, f = {camera.fx:g} pixels) right, are the views in order and steps not above 60°?"
         )
 
 
@@ -330,7 +330,7 @@ def _step(turn: Turn, views: Views) -> float:
             views.flags.append(f"{b}: turned {abs(turned):.1f}° from {a}, the step is {abs(step):.1f}°; taken twice?")
         elif abs(turned) > 1.6 * abs(step):
             views.flags.append(
-                f"{b}: turned {abs(turned):.1f}° from {a}, the step is {abs(step):.1f}°; is a view missing between them?"
+                f"{b}: turned {abs(turned):.1f}° from {a}, the step is {abs(step):.1f}°; is a view missing?"
             )
     covered = float(np.ptp(np.degrees(turn.angles)))
     if covered + 2.0 * abs(step) < 360.0:

@@ -19,7 +19,7 @@ FAR_CM = 5.0  # distances beyond count as this: half hidden views have nothing n
 GAPS = (1, 2, 3)  # views apart, whose agreement the search sums
 UP_TILTS = np.radians(np.arange(-20.0, 81.0, 10.0))  # how far the camera looks down that is tried
 STEPS_DEG = np.arange(6.0, 121.0, 3.0)  # that are tried where no step is given
-BEST_KEPT = 8  # starts of the search that are refined
+BEST_KEPT = 8  # starts of the search that are refined a little; the best two to the end
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def find_turn(
     *,
     step_deg: float | None = None,
     tolerance: float = 0.35,
-    n_samples: int = 400,
+    n_samples: int = 250,
     told: Callable[[str], None] = lambda _: None,
 ) -> Turn:
     """The axis and the angles of views of something that turns by about the same step between each two.
@@ -128,7 +128,7 @@ def find_turn(
         for gap in gaps:
             R = Rotation.from_rotvec(gap * x[5] * up).as_matrix()
             for i in range(len(samples) - gap):
-                points = samples[i][::3] if look == "rough" else samples[i]
+                points = samples[i][::2] if look == "rough" else samples[i]
                 total += getattr(fields[i + gap], look)((points - point) @ R.T + point)
                 n += 1
         return total / n
@@ -146,11 +146,9 @@ def find_turn(
                 starts.append((cost(x, (1,), "rough"), len(starts), x))
     starts.sort(key=lambda start: start[:2])
     gaps = [gap for gap in GAPS if gap < len(clouds)]
-    found = []
-    for _, _, x in _apart(starts):
-        simplex = np.concatenate([[x], x + np.diag([0.1, 0.1, 2.0, 0.0, 2.0, 0.05])[[0, 1, 2, 4, 5]]])
-        found.append(_descend(lambda x: cost(x, gaps, "smooth"), x, simplex))
-    best = min(found, key=lambda pair: pair[0])[1]
+    hills = [_descend(lambda x: cost(x, gaps, "smooth"), x, 70) for _, _, x in _apart(starts)]
+    hills.sort(key=lambda hill: hill[0])
+    best = min((_descend(lambda x: cost(x, gaps, "smooth"), x, 250) for _, x in hills[:2]), key=lambda hill: hill[0])[1]
     up, point = _axis(best)
     told("angles")
     return Turn(up, point, _angles(samples, fields, up, point, float(best[5])))
@@ -167,16 +165,18 @@ def _apart(starts: Sequence[tuple[float, int, FloatArray]]) -> list[tuple[float,
     return kept
 
 
-def _descend(cost: Callable[[FloatArray], float], x: FloatArray, simplex: FloatArray) -> tuple[float, FloatArray]:
-    """Nelder and Mead's search over all but the height of the point, along which nothing changes."""
-    free = [0, 1, 2, 4, 5]
+def _descend(cost: Callable[[FloatArray], float], x: FloatArray, n_most: int) -> tuple[float, FloatArray]:
+    """The least cost that Nelder and Mead's search finds with `n_most` looks, and where; the height of the point, along
+    which nothing changes, stays."""
+    free, first_steps = [0, 1, 2, 4, 5], [0.1, 0.1, 2.0, 2.0, 0.05]
 
     def part(y: FloatArray) -> float:
         whole = x.copy()
         whole[free] = y
         return cost(whole)
 
-    options = {"initial_simplex": simplex[:, free], "maxfev": 220, "xatol": 1e-3, "fatol": 1e-3}
+    simplex = x[free] + np.vstack([np.zeros(5), np.diag(first_steps)])
+    options = {"initial_simplex": simplex, "maxfev": n_most, "xatol": 1e-3, "fatol": 1e-3}
     ended = minimize(part, x[free], method="Nelder-Mead", options=options)
     whole = x.copy()
     whole[free] = ended.x
