@@ -93,6 +93,7 @@ def _as_json(result: Reconstruction) -> dict[str, Any]:
         ],
         "residual_cm": result.residual_cm if result.pairs else None,
         "loop": None if result.loop is None else {"rotation_deg": result.loop[0], "shift_cm": result.loop[1]},
+        "contradicted_share": result.contradicted,
         "rejected": [{"file": view.file, "reason": view.reason} for view in result.rejected],
         "flags": list(result.flags),
         "settings": result.settings,

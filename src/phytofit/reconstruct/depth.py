@@ -29,6 +29,7 @@ __all__ = ["Reconstruction", "read_poses", "reconstruct"]
 
 FloatArray = NDArray[np.float64]
 LEAST_RETURNS = 0.01  # share of an image's pixels; below, the image is empty
+DOUBTFUL, REFUSED = 0.15, 0.4  # shares of points that other views see through; right poses leave some per cent
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +40,8 @@ class Reconstruction:
     is the pot's rim, or the lowest point if no pot was found.  ``n_views`` (n,) counts the views that saw each point.
     ``files`` and ``poses`` (k, 4, 4), camera to world, are those of the views used.  ``turn`` and ``step_deg`` are None
     where poses were given; ``loop`` is what is left of a turn after all pairwise registrations, degrees and cm, None
-    where it does not close.
+    where it does not close.  ``contradicted`` is the share of all points that was dropped, since other views see
+    through them: flying pixels, leaves that moved, views that stand wrong.
     """
 
     cloud: PointCloud
@@ -51,6 +53,7 @@ class Reconstruction:
     turn: Turn | None
     step_deg: float | None
     loop: tuple[float, float] | None
+    contradicted: float
     rejected: tuple[Rejected, ...]
     flags: tuple[str, ...]
     settings: dict[str, Any]
@@ -159,7 +162,8 @@ def read_poses(path: Path, files: Sequence[str]) -> dict[str, FloatArray]:
 
 def _usable(images: Sequence[DepthView], camera: Camera) -> Views:
     """The views that show anything, each once, without flying pixels."""
-    views = Views([image.file for image in images], [image.depth for image in images])
+    files = [image.file for image in images]
+    views = Views(list(files), [image.depth for image in images], files)
     views.keep(
         [bool((depth > 0).mean() >= LEAST_RETURNS) for depth in views.depths],
         lambda i: f"empty: {100 * (views.depths[i] > 0).mean():.1f} % of its pixels hold a depth",
@@ -197,6 +201,12 @@ def _fused(
         camera,
         spacing_cm=spacing,
     )
+    if fused.contradicted > DOUBTFUL:
+        said = f"{100 * fused.contradicted:.0f} % of the points are seen through by other views, expected a few"
+        asked = f"is --camera ({camera.name}, f = {camera.fx:g} pixels) right, and did the leaves keep still?"
+        if fused.contradicted > REFUSED:
+            raise InputError(f"{folder}: the views don't fit each other: {said}; {asked}")
+        views.flags.append(f"{said}; {asked}")
     poses, kept = placed.poses.copy(), fused.points
     if placed.turn is not None and placed.lowest_is_ground:
         poses[:, 2, 3] -= kept[:, 2].min()
@@ -211,6 +221,7 @@ def _fused(
         turn=placed.turn,
         step_deg=placed.step_deg,
         loop=placed.loop,
+        contradicted=fused.contradicted,
         rejected=tuple(views.rejected),
         flags=tuple(views.flags),
         settings={**settings, "spacing_cm": spacing},

@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 LEAST_PIXELS = 200  # of a plant in a view; fewer say nothing about where it stands
 FULL_FRAME = 0.5  # share of an image's pixels that a plant may take
 NEIGHBOUR_DEG = 70.0  # views that differ by less are matched
-LEAST_OVERLAP = 0.35  # of a view with its neighbours, or it is suspect; for all views: the registration is
+LEAST_OVERLAP = 0.3  # of a view with its neighbours, or it is suspect; for all views: the registration is
 MOST_RESIDUAL_CM = 0.6  # median of a registration that is believed
 FLAT = 0.1  # least flatness of a point whose normal is used to register
 DRIFT_CM, DRIFT_RAD = 0.3, 0.005  # how far views may stray from the turntable or the poses given: a leaf sways
@@ -41,6 +41,7 @@ class Views:
 
     files: list[str]
     depths: list[FloatArray]
+    order: list[str]  # all files, those rejected too
     rejected: list[Rejected] = field(default_factory=list)
     flags: list[str] = field(default_factory=list)
 
@@ -303,7 +304,7 @@ def _overlaps(pairs: Sequence[Pair], n: int) -> FloatArray:
 
 
 def _fitting(overlaps: FloatArray) -> list[bool]:
-    return [bool(yes) for yes in (overlaps >= LEAST_OVERLAP) | (overlaps >= 0.6 * np.median(overlaps))]
+    return [bool(yes) for yes in (overlaps >= LEAST_OVERLAP) | (overlaps >= 0.5 * np.median(overlaps))]
 
 
 def _believe(pairs: Sequence[Pair], camera: Camera) -> None:
@@ -328,7 +329,7 @@ def _step(turn: Turn, views: Views) -> float:
         a, b = views.files[i : i + 2]
         if abs(turned) < 0.4 * abs(step):
             views.flags.append(f"{b}: turned {abs(turned):.1f}° from {a}, the step is {abs(step):.1f}°; taken twice?")
-        elif abs(turned) > 1.6 * abs(step):
+        elif abs(turned) > 1.6 * abs(step) and views.order.index(b) == views.order.index(a) + 1:
             views.flags.append(
                 f"{b}: turned {abs(turned):.1f}° from {a}, the step is {abs(step):.1f}°; is a view missing?"
             )
