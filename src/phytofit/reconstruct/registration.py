@@ -23,7 +23,7 @@ class Surface:
     Of the points `n_samples` at most, evenly by index, are matched to other views; all of them are matched to.
     """
 
-    def __init__(self, points: FloatArray, normals: FloatArray, *, n_samples: int = 1500) -> None:
+    def __init__(self, points: FloatArray, normals: FloatArray, *, n_samples: int = 1000) -> None:
         self.points, self.normals = points, normals
         self.tree = cKDTree(points)
         self.sample = np.unique(np.linspace(0, len(points) - 1, min(n_samples, len(points))).round().astype(int))
