@@ -37,11 +37,11 @@ def plant(seed=3):
     return organs
 
 
-def plant_points(n=500_000):
+def plant_points(n=350_000):
     return SurfaceSampler(n, seed=1).draw(plant())[0]
 
 
-def pot_points(radius=POT_RADIUS, density=300.0):
+def pot_points(radius=POT_RADIUS, density=150.0):
     """The wall of a pot, its soil and a table below, rotationally symmetric about z."""
     random = np.random.default_rng(7)
 

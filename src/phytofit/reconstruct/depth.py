@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from phytofit.cloud import MIN_POINTS, SCALE_CM, PointCloud
 from phytofit.errors import InputError, SettingError
@@ -112,14 +113,15 @@ def reconstruct(
     images = read_views(files, chosen, unit=unit)
     given = None if poses is None else read_poses(Path(poses), [image.file for image in images])
     views = _usable(images, chosen)
-    if given is not None:
-        placed = place_by_poses(views, given, chosen, told)
-    else:
-        placed = place_on_turntable(views, chosen, step_deg, told)
-    told("fusion")
     settings = {"step_deg": step_deg, "unit": unit or chosen.unit, "poses": None if poses is None else Path(poses).name,
                 "pattern": pattern, "spacing_cm": spacing_cm}  # fmt: skip
-    return _fused(views, placed, chosen, spacing_cm, folder, settings)
+    with threadpool_limits(limits=1, user_api="blas"):  # more would round sums in another order
+        if given is not None:
+            placed = place_by_poses(views, given, chosen, told)
+        else:
+            placed = place_on_turntable(views, chosen, step_deg, told)
+        told("fusion")
+        return _fused(views, placed, chosen, spacing_cm, folder, settings)
 
 
 def read_poses(path: Path, files: Sequence[str]) -> dict[str, FloatArray]:

@@ -14,7 +14,8 @@ from phytofit.errors import InputError
 __all__ = ["Turn", "find_turn", "moving_pixels", "scene_without_plant", "turn_model", "turn_poses"]
 
 FloatArray = NDArray[np.float64]
-CELL_CM = 1.0  # of the distance fields that the search looks up
+CELL_CM = 1.0  # of the distance fields that the search looks up, at least
+MOST_CELLS = 150  # of a field along each axis: a large plant gets larger cells
 FAR_CM = 5.0  # distances beyond count as this: half hidden views have nothing near
 GAPS = (1, 2, 3)  # views apart, whose agreement the search sums
 UP_TILTS = np.radians(np.arange(-20.0, 81.0, 10.0))  # how far the camera looks down that is tried
@@ -51,28 +52,31 @@ def moving_pixels(
     return (depth > 0) & (depth < scene - least_cm - noise_share * np.where(np.isfinite(scene), scene, 0.0))
 
 
-class _Field:
-    """Distances to a view's points, cm, looked up in a grid."""
+class _Fields:
+    """Distances to the points of each view, cm, at most `FAR_CM`, looked up in grids of one shape."""
 
-    def __init__(self, points: FloatArray, low: FloatArray, shape: Sequence[int]) -> None:
-        grid = np.ones(shape, bool)
-        cells = np.floor((points - low) / CELL_CM).astype(int)
-        cells = cells[((cells >= 0) & (cells < shape)).all(axis=1)]
-        grid[tuple(cells.T)] = False
-        self.low, self.shape = low, np.array(shape)
-        distance = ndimage.distance_transform_edt(grid) * CELL_CM
-        self.distance = np.minimum(distance, FAR_CM).astype(np.float32)
+    def __init__(self, clouds: Sequence[FloatArray], centre: FloatArray, reach: float) -> None:
+        self.low, self.cell = centre - reach, max(CELL_CM, 2 * reach / MOST_CELLS)
+        n_cells = int(2 * reach / self.cell) + 1
+        self.distance = np.full((len(clouds), *(n_cells + 2,) * 3), FAR_CM, dtype=np.float32)  # a rim all around
+        for field, points in zip(self.distance, clouds, strict=True):
+            free = np.ones((n_cells,) * 3, bool)
+            cells = np.floor((points - self.low) / self.cell).astype(int)
+            free[tuple(cells[((cells >= 0) & (cells < n_cells)).all(axis=1)].T)] = False
+            field[1:-1, 1:-1, 1:-1] = np.minimum(ndimage.distance_transform_edt(free) * self.cell, FAR_CM)
 
-    def rough(self, points: FloatArray) -> float:
-        cells = np.floor((points - self.low) / CELL_CM).astype(int)
-        inside = ((cells >= 0) & (cells < self.shape)).all(axis=1)
-        total = float(self.distance[tuple(cells[inside].T)].sum()) + FAR_CM * int((~inside).sum())
-        return total / len(points)
+    def rough(self, points: FloatArray, first: int) -> float:
+        """The mean distance of points (k, m, 3) of k views to the views from `first` on, to the nearest cell."""
+        cells = ((points - self.low) / self.cell + 1.0).astype(np.intp).clip(0, self.distance.shape[1] - 1)
+        view = first + np.arange(len(points))[:, None]
+        return float(self.distance[view, cells[..., 0], cells[..., 1], cells[..., 2]].mean())
 
-    def smooth(self, points: FloatArray) -> float:
-        places = (points - self.low) / CELL_CM - 0.5
-        found = ndimage.map_coordinates(self.distance, places.T, order=1, mode="constant", cval=FAR_CM)
-        return float(found.mean())
+    def smooth(self, points: FloatArray, first: int) -> float:
+        """The same, between the cells."""
+        places = np.empty((4, points.shape[0] * points.shape[1]))
+        places[0] = np.repeat(first + np.arange(len(points)), points.shape[1])
+        places[1:] = ((points - self.low) / self.cell + 0.5).reshape(-1, 3).T
+        return float(ndimage.map_coordinates(self.distance, places, order=1, mode="constant", cval=FAR_CM).mean())
 
 
 def _turned(points: FloatArray, up: FloatArray, point: FloatArray, angle: float) -> FloatArray:
@@ -116,22 +120,15 @@ def find_turn(
     """
     if len(clouds) < 3:
         raise InputError(f"found {len(clouds)} views with a plant, expected at least 3 of a turntable")
-    samples = [c[np.unique(np.linspace(0, len(c) - 1, min(n_samples, len(c))).astype(int))] for c in clouds]
-    together = np.concatenate(samples)
-    centre = np.median(together, axis=0)
-    reach = float(np.quantile(np.linalg.norm(together - centre, axis=1), 0.99)) + 2 * FAR_CM
-    low = centre - reach
-    fields = [_Field(c, low, (int(2 * reach / CELL_CM) + 1,) * 3) for c in clouds]
+    samples = np.stack([c[np.linspace(0, len(c) - 1, n_samples).astype(int)] for c in clouds])
+    centre = np.median(samples.reshape(-1, 3), axis=0)
+    reach = float(np.quantile(np.linalg.norm(samples.reshape(-1, 3) - centre, axis=1), 0.99)) + 2 * FAR_CM
+    fields = _Fields(clouds, centre, reach)
+    few = samples[:, ::2]
 
-    def cost(x: FloatArray, gaps: Sequence[int], look: str) -> float:
-        (up, point), total, n = _axis(x), 0.0, 0
-        for gap in gaps:
-            R = Rotation.from_rotvec(gap * x[5] * up).as_matrix()
-            for i in range(len(samples) - gap):
-                points = samples[i][::2] if look == "rough" else samples[i]
-                total += getattr(fields[i + gap], look)((points - point) @ R.T + point)
-                n += 1
-        return total / n
+    def cost(x: FloatArray) -> float:
+        up, point = _axis(x)
+        return float(np.mean([fields.smooth(_turned(samples[:-gap], up, point, gap * x[5]), gap) for gap in gaps]))
 
     told("axis and step")
     tries = STEPS_DEG if step_deg is None else step_deg * np.linspace(1 - tolerance, 1 + tolerance, 15)
@@ -143,12 +140,13 @@ def find_turn(
             point = centre + np.array([0.0, 0.0, offset])
             for step in steps:
                 x = np.array([tilt, 0.0, *point, step])
-                starts.append((cost(x, (1,), "rough"), len(starts), x))
+                rough = fields.rough(_turned(few[:-1], *_axis(x), step), 1)
+                starts.append((rough, len(starts), x))
     starts.sort(key=lambda start: start[:2])
     gaps = [gap for gap in GAPS if gap < len(clouds)]
-    hills = [_descend(lambda x: cost(x, gaps, "smooth"), x, 70) for _, _, x in _apart(starts)]
+    hills = [_descend(cost, x, 70) for _, _, x in _apart(starts)]
     hills.sort(key=lambda hill: hill[0])
-    best = min((_descend(lambda x: cost(x, gaps, "smooth"), x, 250) for _, x in hills[:2]), key=lambda hill: hill[0])[1]
+    best = min((_descend(cost, x, 250) for _, x in hills[:2]), key=lambda hill: hill[0])[1]
     up, point = _axis(best)
     told("angles")
     return Turn(up, point, _angles(samples, fields, up, point, float(best[5])))
@@ -183,14 +181,12 @@ def _descend(cost: Callable[[FloatArray], float], x: FloatArray, n_most: int) ->
     return float(ended.fun), whole
 
 
-def _angles(
-    samples: Sequence[FloatArray], fields: Sequence[_Field], up: FloatArray, point: FloatArray, step: float
-) -> FloatArray:
+def _angles(samples: FloatArray, fields: _Fields, up: FloatArray, point: FloatArray, step: float) -> FloatArray:
     """The angle of each view: the common step, unless none, two or three steps fit a pair clearly better."""
 
     def cost(i: int, angle: float) -> float:
-        there = fields[i + 1].smooth(_turned(samples[i], up, point, angle))
-        back = fields[i].smooth(_turned(samples[i + 1], up, point, -angle))
+        there = fields.smooth(_turned(samples[i : i + 1], up, point, angle), i + 1)
+        back = fields.smooth(_turned(samples[i + 1 : i + 2], up, point, -angle), i)
         return (there + back) / 2
 
     turned = [0.0]
