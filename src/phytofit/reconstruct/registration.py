@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 __all__ = ["Pair", "Surface", "exp_pose", "log_pose", "move_points", "pair_quality", "register"]
 
 FloatArray = NDArray[np.float64]
-REACHES_CM = (3.0, 2.0, 1.5, 1.0, 1.0)  # how far apart matches may be, from coarse to fine
-ROUNDS = 5  # of matching at each reach, at most
+REACHES_CM = (3.0, 2.0, 1.5, 1.0)  # how far apart matches may be, from coarse to fine
+ROUNDS, LAST_ROUNDS = 2, 8  # of matching at each reach, and at the last, at most
 SAME_SIDE = 0.5  # least cosine between the normals of a match: leaves and stems have two sides
-AT_REST = 1e-3  # cm, and radians times the plant's size: smaller steps end a reach
+AT_REST = 5e-3  # cm, at the plant's rim for rotations: smaller steps end a reach
 
 
 class Surface:
@@ -95,7 +95,7 @@ def register(
     )
     size = max(float(np.linalg.norm(np.ptp(s.points, axis=0))) for s in surfaces)
     for reach in reaches_cm:
-        for _ in range(ROUNDS):
+        for _ in range(LAST_ROUNDS if reach == reaches_cm[-1] else ROUNDS):
             now = model(x)
             H, b = _normal_equations(surfaces, now, pairs, reach, centre)
             J = _jacobian(model, x, now, centre)
@@ -103,7 +103,7 @@ def register(
             step = -np.linalg.solve(A + 1e-6 * np.trace(A) / len(A) * np.eye(len(A)), J.T @ b + stiff * x)
             x = x + step
             moved = (J @ step).reshape(-1, 6)
-            if np.abs(moved * np.repeat([size / 2, 1.0], 3)).max() < AT_REST * reach:
+            if np.abs(moved * np.repeat([size / 2, 1.0], 3)).max() < AT_REST:
                 break
     return x
 
