@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: install demo test test-long check bench bench-accuracy paper docs
+.PHONY: install demo test test-long check bench bench-accuracy bench-segment paper docs
 
 install: .venv/installed
 
@@ -45,6 +45,9 @@ paper: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[paper]'
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[peers]' || true
 	$(BIN)/python -m evaluation $(if $(FULL),--full)
+
+bench-reconstruct: install
+	$(BIN)/python benchmarks/reconstruct.py
 
 docs: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'

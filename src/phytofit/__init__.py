@@ -25,20 +25,23 @@ from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move
 from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parameters import Parameter, ParameterSpace
-from phytofit.plots import plot_convergence, plot_fit
+from phytofit.plots import plot_convergence, plot_fit, plot_reconstruction
 from phytofit.pose import StartPose, start_poses
 from phytofit.posterior import Estimate
 from phytofit.preparation import Prepared, prepare
 from phytofit.recipe import recipe
-from phytofit.results import save_fit, trait_table
+from phytofit.reconstruct import CAMERAS, Camera, Reconstruction, load_camera, reconstruct
+from phytofit.results import save_fit, save_reconstruction, trait_table
 from phytofit.simulation import SimulatedPhytomer, add_noise, add_outliers, occlude, simulate
 from phytofit.species import Species, load_species
 from phytofit.traits import Trait, measure
 from phytofit.validation import Agreement, Comparison, agreement, compare, read_measures, read_results
 
 __all__ = [
+    "CAMERAS",
     "DISTANCES",
     "Agreement",
+    "Camera",
     "CloudError",
     "CloudLikelihood",
     "Comparison",
@@ -57,6 +60,7 @@ __all__ = [
     "Phytomer",
     "PointCloud",
     "Prepared",
+    "Reconstruction",
     "Reference",
     "Registration",
     "SettingError",
@@ -74,6 +78,7 @@ __all__ = [
     "compare",
     "fit",
     "from_points",
+    "load_camera",
     "load_species",
     "mean_at",
     "measure",
@@ -83,13 +88,16 @@ __all__ = [
     "occlude",
     "plot_convergence",
     "plot_fit",
+    "plot_reconstruction",
     "prepare",
     "read_cloud",
     "read_measures",
     "read_results",
     "recipe",
+    "reconstruct",
     "remove_outliers",
     "save_fit",
+    "save_reconstruction",
     "simulate",
     "start_poses",
     "thin",

@@ -119,10 +119,11 @@ def read_cloud(
     )
 
 
-def write_cloud(path: str | Path, cloud: PointCloud) -> None:
+def write_cloud(path: str | Path, cloud: PointCloud, extra: Columns | None = None) -> None:
     """Write a cloud, in the unit and the frame it was read in: all of it, or nothing.
 
-    The suffix says the format: ``.ply`` (binary, little endian) or ``.xyz`` (text under a line of names).
+    The suffix says the format: ``.ply`` (binary, little endian) or ``.xyz`` (text under a line of names).  `extra` are
+    more columns (n,), by name: 32-bit integers or doubles.
 
     Raises
     ------
@@ -137,6 +138,7 @@ def write_cloud(path: str | Path, cloud: PointCloud) -> None:
         columns |= zip(NORMAL, cloud.normals.T, strict=True)
     if cloud.colors is not None:
         columns |= zip(COLOR, cloud.colors.T, strict=True)
+    columns |= extra or {}
     frame = pd.DataFrame(columns)
     if path.suffix.lower() == ".ply":
         rows = frame.to_records(index=False)

@@ -2,12 +2,12 @@
 
 import sys
 
-from phytofit.cli import measure, validate
+from phytofit.cli import measure, reconstruct, validate
 from phytofit.cli.console import app, err
 
 __all__ = ["app", "main"]
 
-COMMANDS = (measure, validate)  # modules that add theirs to the program when they are imported
+COMMANDS = (measure, reconstruct, validate)  # modules that add theirs to the program when they are imported
 
 
 def main() -> None:

@@ -1,11 +1,8 @@
-"""What a result looks like on disk: one folder a cloud, one table over all, nothing half-written."""
+"""What a fit looks like on disk: one folder a cloud, and a tidy table."""
 
 import hashlib
 import json
-import os
-import shutil
-import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -14,17 +11,16 @@ import numpy as np
 import pandas as pd
 
 from phytofit.cloud import PointCloud
-from phytofit.errors import OutputError
 from phytofit.fitting import Fit
 from phytofit.models import mesh
 from phytofit.plots import plot_convergence, plot_fit
 from phytofit.recipe import recipe_of
+from phytofit.results.files import table_text, whole_folder
 from phytofit.traits import Trait
 
-__all__ = ["COLUMNS", "prepare_folder", "result_names", "save_fit", "trait_table", "write_text"]
+__all__ = ["COLUMNS", "save_fit", "trait_table"]
 
 COLUMNS = ["cloud", "organ", "rank", "trait", "value", "unit", "low", "high", "method", "flags"]
-DIGITS = 6  # significant, in tables; fit.json has all
 
 
 def trait_table(name: str, traits: Iterable[Trait]) -> pd.DataFrame:
@@ -35,55 +31,13 @@ def trait_table(name: str, traits: Iterable[Trait]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=COLUMNS).astype({"low": float, "high": float})
 
 
-def result_names(paths: Sequence[Path]) -> list[str]:
-    """A name for each cloud: its file's stem; names that collide take the parent folder's name in front, then the
-    file's ending behind, then a number."""
-    folders = [path.resolve().parent.name for path in paths]
-    names = [path.stem for path in paths]
-    for longer in (
-        [f"{folder}_{path.stem}" for folder, path in zip(folders, paths, strict=True)],
-        [f"{folder}_{path.name.replace('.', '_')}" for folder, path in zip(folders, paths, strict=True)],
-        [f"{folder}_{path.stem}_{i}" for i, (folder, path) in enumerate(zip(folders, paths, strict=True), start=1)],
-    ):
-        names = [long if names.count(name) > 1 else name for name, long in zip(names, longer, strict=True)]
-    return names
-
-
-def prepare_folder(folder: Path) -> Path:
-    """Make sure that results can be written to the folder; OutputError if not."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: results can't be written there ({error.strerror}); name another folder with --out"
-        ) from None
-    return folder
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a whole file or nothing."""
-    part = path.with_name(f".{path.name}.part-{os.getpid()}")
-    try:
-        part.write_text(text, encoding="utf-8", newline="")
-        part.replace(path)
-    except OSError as error:
-        part.unlink(missing_ok=True)
-        raise OutputError(f"{path}: can't be written ({error.strerror})") from None
-
-
 def save_fit(result: Fit, cloud: PointCloud, folder: str | Path, name: str | None = None) -> Path:
     """Write ``folder/name/``: fit.json, traits.csv, model.ply, fit.png and convergence.png; all of them or none.
 
     A folder of that name from an earlier run is replaced.  model.ply is in the input's unit and frame.
     """
     name = name or cloud.name
-    folder = prepare_folder(Path(folder))
-    target = folder / name
-    part = Path(tempfile.mkdtemp(prefix=f".{name}.part-", dir=folder))
-    try:
-        part.chmod(0o755)
+    with whole_folder(Path(folder), name) as part:
         (part / "fit.json").write_text(json.dumps(_as_json(result, cloud, name), indent=1) + "\n", encoding="utf-8")
         (part / "traits.csv").write_text(table_text(trait_table(name, result.traits)), encoding="utf-8", newline="")
         model = mesh(result.organs)
@@ -91,20 +45,7 @@ def save_fit(result: Fit, cloud: PointCloud, folder: str | Path, name: str | Non
         model.export(part / "model.ply")
         plot_fit(result, title=name).savefig(part / "fit.png", dpi=150, metadata={"Software": None})
         plot_convergence(result).savefig(part / "convergence.png", dpi=150, metadata={"Software": None})
-        if target.exists():
-            shutil.rmtree(target)
-        part.rename(target)
-    except OSError as error:
-        raise OutputError(f"{target}: the result can't be written ({error.strerror})") from None
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-    return target
-
-
-def table_text(table: pd.DataFrame) -> str:
-    """The table as CSV, `DIGITS` significant digits, empty where there is no value."""
-    text: str = table.to_csv(index=False, float_format=f"%.{DIGITS}g", lineterminator="\n")
-    return text
+    return Path(folder) / name
 
 
 def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
