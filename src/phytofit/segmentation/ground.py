@@ -11,11 +11,12 @@ LOWEST = 4  # layers that have to be spread evenly in all directions: the bottom
 HIGHEST = 40  # layers: ground and pot are at most half of the cloud's height
 N_CELLS = 24  # across the foot, in which area is counted
 NECK = 0.15  # of the area of the layers below: what is above ground is narrower
-EVEN = 0.4  # thin over wide of the foot
+EVEN = 0.6  # thin over wide of the foot
 N_SECTORS = 12
-LEAST_SECTORS = 9
+LEAST_SECTORS = 10
 LEAST_RADIUS = 0.05  # of the cloud's height: a stem's own foot is narrower
-LEAST_SHARE = 0.02  # of the points that lie in the foot, were it ground
+LEAST_FOOT = 30  # points in the lowest layers
+LEAST_SHARE = 0.05  # of the points, that are ground or pot at least
 BESIDE = 1.2  # radii of the foot, within which it is removed
 AXES = np.vstack([np.eye(3)[[2, 1, 0]], -np.eye(3)[[2, 1, 0]]])
 
@@ -43,7 +44,7 @@ def _ground_along(points: FloatArray, up: FloatArray) -> NDArray[np.bool_]:
     side = np.linalg.svd(up[np.newaxis])[2][1:]
     flat = points @ side.T
     foot = flat[layer < LOWEST]
-    if len(foot) < max(30, LEAST_SHARE * len(points)):
+    if len(foot) < LEAST_FOOT:
         return none
     center = 0.5 * (np.quantile(foot, 0.02, axis=0) + np.quantile(foot, 0.98, axis=0))
     eigen = np.linalg.eigvalsh(np.cov(foot.T))
@@ -63,5 +64,6 @@ def _ground_along(points: FloatArray, up: FloatArray) -> NDArray[np.bool_]:
     for i in range(1, HIGHEST - 1):
         below = np.median(area[:i])
         if 0 < area[i : i + 2].max() <= NECK * below:
-            return np.asarray(beside & (layer < i))
+            ground = np.asarray(beside & (layer < i))
+            return ground if ground.mean() >= LEAST_SHARE else none
     return none

@@ -19,6 +19,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 LEAST_TIP = 0.015  # of the greatest distance over the plant: what sticks out less is not an end
 APART = 0.02  # of that distance: nearer ends are one
+AROUND = 0.06  # of that distance: neighbourhood of an end,
+ONE_SIDED = 0.3  # of whose radius its centre lies beside the end
 FOOT = 0.1  # of that distance: of the stem, that must be round in any case
 PROBE = 0.05  # of that distance: from where to where a direction is measured
 STRAIGHT_WEIGHT = 0.5  # against roundness and forwardness
@@ -59,7 +61,11 @@ def _ends(graph: PlantGraph) -> list[int]:
     ends = [start, *tips_of(graph, distance, LEAST_TIP * far)]
     for direction in DIRECTIONS:
         end = int(np.argmax(graph.points @ direction))
-        if np.linalg.norm(graph.points[ends] - graph.points[end], axis=1).min() > APART * far:
+        offset = graph.points - graph.points[end]
+        around = offset[np.linalg.norm(offset, axis=1) < AROUND * far]
+        if np.linalg.norm(around.mean(axis=0)) < ONE_SIDED * AROUND * far:  # in the middle of a bent leaf
+            continue
+        if np.linalg.norm(offset[ends], axis=1).min() > APART * far:
             ends.append(end)
     return list(dict.fromkeys(ends))
 
