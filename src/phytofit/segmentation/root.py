@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from phytofit.segmentation.graph import PlantGraph, geodesics, path_to_root, tips_of
 from phytofit.segmentation.growing import grow
-from phytofit.segmentation.organs import Organs, find_organs, roundness
+from phytofit.segmentation.organs import Organs, along_path, find_organs, roundness
 
 __all__ = ["find_root"]
 
@@ -19,8 +19,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 LEAST_TIP = 0.015  # of the greatest distance over the plant: what sticks out less is not an end
 APART = 0.02  # of that distance: nearer ends are one
-AROUND = 0.06  # of that distance: neighbourhood of an end,
-ONE_SIDED = 0.3  # of whose radius its centre lies beside the end
+AROUND = 0.06  # of that distance: neighbourhood of an end, all of which lies before it
 FOOT = 0.1  # of that distance: of the stem, that must be round in any case
 PROBE = 0.05  # of that distance: from where to where a direction is measured
 STRAIGHT_WEIGHT = 0.5  # against roundness and forwardness
@@ -61,11 +60,7 @@ def _ends(graph: PlantGraph) -> list[int]:
     ends = [start, *tips_of(graph, distance, LEAST_TIP * far)]
     for direction in DIRECTIONS:
         end = int(np.argmax(graph.points @ direction))
-        offset = graph.points - graph.points[end]
-        around = offset[np.linalg.norm(offset, axis=1) < AROUND * far]
-        if np.linalg.norm(around.mean(axis=0)) < ONE_SIDED * AROUND * far:  # in the middle of a bent leaf
-            continue
-        if np.linalg.norm(offset[ends], axis=1).min() > APART * far:
+        if np.linalg.norm(graph.points[ends] - graph.points[end], axis=1).min() > APART * far:
             ends.append(end)
     return list(dict.fromkeys(ends))
 
@@ -81,7 +76,13 @@ def _likeness(graph: PlantGraph, root: int) -> tuple[float, FloatArray | None]:
     length = float(np.linalg.norm(np.diff(organs.path, axis=0), axis=1).sum())
     straight = float(np.linalg.norm(organs.path[-1] - organs.path[0])) / max(length, 1e-12)
     round_stem = roundness(graph, distance, foot) + roundness(graph, distance, stem)
-    return round_stem + _forward(graph, distance, before, organs) + STRAIGHT_WEIGHT * straight, organs.path
+    near = distance < AROUND * float(distance.max())
+    _, along, place = along_path(graph.points[near], organs.path)
+    ahead = place[np.argmax(along)] - organs.path[0]
+    ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-12)
+    before_it = float(((graph.points[near] - graph.points[root]) @ ahead).mean()) / (AROUND * float(distance.max()))
+    at_end = min(2.0 * before_it, 1.0)  # 1 at the end of a stem, 0 in its middle
+    return round_stem + at_end + _forward(graph, distance, before, organs) + STRAIGHT_WEIGHT * straight, organs.path
 
 
 def _forward(graph: PlantGraph, distance: FloatArray, before: IntArray, organs: Organs) -> float:
