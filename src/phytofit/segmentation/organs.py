@@ -16,6 +16,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 LOBE = 0.35  # of a leaf's length: a shorter end that parts from it away from the stem is a lobe of it
 SMALL_LOBE = 0.1  # of the length beyond what two ends share: so short an end is a lobe, whatever they share
+THIN = 0.3  # of the sections of what leaves share, the share that is the stem's alone for sure
+WHORL = 1.5  # times thicker than those, it is no longer stem
 FLAT = 0.4  # thin over wide of the sections: what leaves share with less is a blade, not a stem
 STICKS_OUT = 1.8  # stem radii from the axis, and beyond: a leaf's base
 SLICE = 2.5  # typical distances of neighbours, thickness of a section
@@ -51,9 +53,10 @@ def find_organs(graph: PlantGraph, distance: FloatArray, regions: list[Region], 
         tips.append(tip)
         levels.append(level)
         labels[nodes] = len(tips) + 1
-    path = centerline(graph.points[stem], distance[stem], max(SLICE * graph.spacing, 0.012 * float(distance.max())))
-    path, radius = _robust_axis(graph, distance, stem, path)
-    _trim(graph, labels, path, radius)
+    path, radius, top = _axis(graph, distance, stem)
+    gap, _, _ = along_path(graph.points, path)
+    out = (labels == 1) & ((gap > STICKS_OUT * radius + 0.5 * graph.spacing) | (distance > top))
+    _give_away(graph, labels, out)
     return Organs(labels, path, radius, tuple(tips), tuple(levels))
 
 
@@ -148,22 +151,38 @@ def centerline(points: FloatArray, distance: FloatArray, thickness: float) -> Fl
     return smooth
 
 
-def _robust_axis(
-    graph: PlantGraph, distance: FloatArray, stem: IntArray, path: FloatArray
-) -> tuple[FloatArray, float]:
-    """The axis and radius of the stem without the bases of leaves, which stick out of it."""
-    radius = 0.0
-    for _ in range(3):
-        gap, _, _ = along_path(graph.points[stem], path)
-        radius = max(float(np.median(gap)), 0.5 * graph.spacing)
-        inside = stem[gap < STICKS_OUT * radius + 0.5 * graph.spacing]
+def _axis(
+    graph: PlantGraph, distance: FloatArray, stem: IntArray
+) -> tuple[FloatArray, float, float]:
+    """The stem's axis and radius without the bases of leaves, and the distance beyond which it is a whorl of leaves.
+
+    A stem is about as thick all along; where several leaves share what is thicker, they are rolled around each other.
+    """
+    thickness = max(SLICE * graph.spacing, 0.012 * float(distance.max()))
+    band = ((distance[stem] - distance[stem].min()) / thickness).astype(int)
+    bands = np.unique(band)
+    centers = np.array([np.median(graph.points[stem[band == b]], axis=0) for b in bands])
+    spread = np.array(
+        [np.median(np.linalg.norm(graph.points[stem[band == b]] - c, axis=1)) for b, c in zip(bands, centers, strict=True)]
+    )
+    radius = max(float(np.quantile(spread, THIN)), 0.5 * graph.spacing)
+    thin = np.flatnonzero(spread <= WHORL * radius)
+    last = bands[thin[-1]] if len(thin) else bands[-1]
+    top = float(distance[stem].min() + (last + 1) * thickness)
+    path = centerline(graph.points[stem], distance[stem], thickness)
+    for _ in range(2):
+        below = stem[distance[stem] <= top]
+        gap, _, _ = along_path(graph.points[below], path)
+        inside = below[gap < STICKS_OUT * radius + 0.5 * graph.spacing]
         if len(inside) < 6:
             break
-        thickness = max(SLICE * graph.spacing, 0.012 * float(distance.max()), 0.7 * radius)
-        path = centerline(graph.points[inside], distance[inside], thickness)
-        if len(path) < 2:
-            path = graph.points[inside[[0, -1]]]
-    return path, radius
+        path = centerline(graph.points[inside], distance[inside], max(thickness, 0.7 * radius))
+    if len(path) < 2:
+        path = graph.points[stem[[0, -1]]]
+    gap, _, _ = along_path(graph.points[stem], path)
+    on_it = gap < STICKS_OUT * radius + 0.5 * graph.spacing
+    radius = max(float(np.median(gap[on_it & (distance[stem] <= top)])), 1e-6) if on_it.any() else radius
+    return path, radius, top
 
 
 def along_path(points: FloatArray, path: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -184,10 +203,8 @@ def along_path(points: FloatArray, path: FloatArray) -> tuple[FloatArray, FloatA
     return best, along, place
 
 
-def _trim(graph: PlantGraph, labels: NDArray[np.int64], path: FloatArray, radius: float) -> None:
-    """Give what sticks out of the stem to the leaf that it is connected with outside the stem."""
-    gap, _, _ = along_path(graph.points, path)
-    out = (labels == 1) & (gap > STICKS_OUT * radius + 0.5 * graph.spacing)
+def _give_away(graph: PlantGraph, labels: NDArray[np.int64], out: NDArray[np.bool_]) -> None:
+    """Give what is not the stem's to the leaf that it is connected with outside the stem."""
     part = np.flatnonzero(out | (labels > 1))
     sources = np.flatnonzero(labels[part] > 1)
     if not out.any() or len(sources) == 0:
