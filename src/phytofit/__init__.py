@@ -11,6 +11,7 @@ from phytofit.errors import (
     CloudError,
     InputError,
     NoPhytomerError,
+    NoStemError,
     OutputError,
     PhytofitError,
     SettingError,
@@ -25,12 +26,13 @@ from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move
 from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parameters import Parameter, ParameterSpace
-from phytofit.plots import plot_convergence, plot_fit
+from phytofit.plots import plot_convergence, plot_fit, plot_segmentation
 from phytofit.pose import StartPose, start_poses
 from phytofit.posterior import Estimate
 from phytofit.preparation import Prepared, prepare
 from phytofit.recipe import recipe
-from phytofit.results import save_fit, trait_table
+from phytofit.results import leaf_table, save_fit, save_segmentation, trait_table
+from phytofit.segmentation import Segmentation, SegmentedLeaf, segment
 from phytofit.simulation import SimulatedPhytomer, add_noise, add_outliers, occlude, simulate
 from phytofit.species import Species, load_species
 from phytofit.traits import Trait, measure
@@ -45,6 +47,7 @@ __all__ = [
     "Generation",
     "InputError",
     "NoPhytomerError",
+    "NoStemError",
     "Organ",
     "OutputError",
     "PaperObjective",
@@ -56,6 +59,8 @@ __all__ = [
     "Prepared",
     "Reference",
     "Registration",
+    "Segmentation",
+    "SegmentedLeaf",
     "SettingError",
     "SimulatedPhytomer",
     "Species",
@@ -69,6 +74,7 @@ __all__ = [
     "add_outliers",
     "fit",
     "from_points",
+    "leaf_table",
     "load_species",
     "measure",
     "mesh",
@@ -77,11 +83,14 @@ __all__ = [
     "occlude",
     "plot_convergence",
     "plot_fit",
+    "plot_segmentation",
     "prepare",
     "read_cloud",
     "recipe",
     "remove_outliers",
     "save_fit",
+    "save_segmentation",
+    "segment",
     "simulate",
     "start_poses",
     "thin",

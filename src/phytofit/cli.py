@@ -21,7 +21,17 @@ from phytofit.optimize import Generation
 from phytofit.preparation import AXES, parse_up
 from phytofit.recipe import defaults, recipe
 from phytofit.report import agreement_page, agreement_table
-from phytofit.results import prepare_folder, result_names, save_fit, table_text, trait_table, write_text
+from phytofit.results import (
+    leaf_table,
+    prepare_folder,
+    result_names,
+    save_fit,
+    save_segmentation,
+    table_text,
+    trait_table,
+    write_text,
+)
+from phytofit.segmentation import Segmentation, segment
 from phytofit.simulation import SimulatedPhytomer, simulate
 from phytofit.species import Species, load_species, species_names
 from phytofit.traits import Trait, measure
@@ -51,17 +61,19 @@ Seed = Annotated[int, typer.Option(help="The same seed gives the same result.", 
 SpeciesOption = Annotated[
     str, typer.Option(help=f"A species that comes with phytofit ({', '.join(species_names())}), or a TOML file.")
 ]
+UnitsOption = Annotated[
+    str | None, typer.Option("--units", "-u", help="Unit of the coordinates: cm, mm, m; none: relative lengths.")
+]
+UpOption = Annotated[str | None, typer.Option(help=f"Upward direction where it is known: {', '.join(AXES)}.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.", file_okay=True)]
 
 
 @app.command("fit")
 def fit_command(
     clouds: Annotated[list[Path], typer.Argument(help="Point clouds: PLY, PCD, LAS/LAZ, XYZ, TXT, CSV, PTS, ASC.")],
-    units: Annotated[
-        str | None, typer.Option("--units", "-u", help="Unit of the coordinates: cm, mm, m; none: relative lengths.")
-    ] = None,
+    units: UnitsOption = None,
     species: SpeciesOption = FIT["species"],
-    up: Annotated[str | None, typer.Option(help=f"Upward direction where it is known: {', '.join(AXES)}.")] = None,
+    up: UpOption = None,
     seed_point: Annotated[
         list[str] | None,
         typer.Option(
@@ -165,6 +177,72 @@ def _seed_points(given: list[str], n_clouds: int) -> list[list[float]] | None:
     if any(len(point) != 3 for point in points):
         raise SettingError(f"--seed-point: expected X,Y,Z, got {', '.join(given)!r}")
     return points or None
+
+
+@app.command("segment")
+def segment_command(
+    clouds: Annotated[list[Path], typer.Argument(help="Clouds of whole plants: PLY, PCD, LAS/LAZ, XYZ, TXT, CSV, ...")],
+    units: UnitsOption = None,
+    up: UpOption = None,
+    labels: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Take stem and leaves from this property (1 stem, 2.. leaves) instead of finding them: "
+            "`label` in a corrected plant.ply.",
+        ),
+    ] = None,
+    folder: OutOption = Path("plants"),
+) -> None:
+    """Take plants apart: stem, leaves numbered from the base, and a cloud of each leaf with its piece of stem.
+
+    Writes, for each cloud, DIR/NAME/ with segmentation.png (look at it first), leaves.csv, plant.ply (all points with
+    their labels: 0 none, 1 stem, 2.. leaves) and phytomers/leaf_01.ply and on, ready for `phytofit fit`; and
+    DIR/leaves.csv over all. Where a leaf is wrong, edit the labels in plant.ply and give it back with --labels label.
+
+    Examples:
+
+        phytofit segment plant.ply --units mm --up z --out plants
+
+        phytofit fit plants/plant/phytomers/*.ply --units mm --out results
+
+        phytofit segment corrected.ply --units mm --labels label
+    """
+    _or_exit(lambda: prepare_folder(folder))
+    _or_exit(lambda: parse_up(up))
+    tables = []
+    for path, name in zip(clouds, result_names(clouds), strict=True):
+        try:
+            with err.status(f"{name}: looking for stem and leaves"):
+                cloud = _read(path, units, labels or "label")
+                result = segment(cloud, up=up, labelled=labels is not None)
+                where = save_segmentation(result, folder, name)
+        except PhytofitError as error:
+            _complain(error if str(path) in str(error) or path.name in str(error) else f"{path}: {error}")
+            continue
+        tables.append(leaf_table(name, result))
+        _print_leaves(result, name, where)
+    if tables:
+        _or_exit(lambda: write_text(folder / "leaves.csv", table_text(pd.concat(tables))))
+        out.print(f"{len(tables)} of {len(clouds)} plants taken apart: {folder / 'leaves.csv'}", highlight=False)
+    raise typer.Exit(0 if len(tables) == len(clouds) else 1 if tables else 2)
+
+
+def _print_leaves(result: Segmentation, name: str, where: Path) -> None:
+    unit = "rel" if result.cloud.unit == "none" else "cm"
+    table = Table(title=f"{name}: {len(result.leaves)} leaves")
+    for column in ("leaf", f"collar along the stem, {unit}", f"length, {unit}", "azimuth, deg", "points"):
+        table.add_column(column, justify="right")
+    for leaf in result.leaves:
+        numbers = (f"{leaf.collar_distance:.1f}", f"{leaf.length:.1f}", f"{leaf.azimuth:.0f}", str(leaf.n_points))
+        table.add_row(str(leaf.rank), *numbers)
+    out.print(table)
+    for note in (*result.cloud.notes, *result.notes):
+        out.print(f"note: {note}", highlight=False)
+    for leaf in result.leaves:
+        for flag in leaf.flags:
+            out.print(f"[bold yellow]flag:[/] leaf {leaf.rank}: {flag}", highlight=False)
+    out.print(f"Look at {where / 'segmentation.png'}", highlight=False)
 
 
 @app.command("simulate")

@@ -12,15 +12,19 @@ from numpy.typing import NDArray
 
 from phytofit.fitting import Fit
 from phytofit.models import LEAF, STEM, Organ, mesh, move
+from phytofit.segmentation import Segmentation
 from phytofit.validation import Agreement
 
-__all__ = ["plot_agreement", "plot_convergence", "plot_fit"]
+__all__ = ["plot_agreement", "plot_convergence", "plot_fit", "plot_segmentation"]
 
 FloatArray = NDArray[np.float64]
 COLORS = {STEM: "#D55E00", LEAF: "#009E73"}  # Okabe and Ito: told apart by the colour-blind
 REFERENCE = "#333333"
 VIEWS = (("from the side", 0, 2), ("from the front", 1, 2), ("from above", 0, 1))
 FEW = 8  # pairs, up to which each is named; of more only those that are far off
+LEAF_COLORS = ("#E69F00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442")  # Okabe and Ito, by rank
+STEM_COLOR, UNKNOWN_COLOR = "#000000", "#BBBBBB"
+MOST_DRAWN = 30_000  # points of a plant
 SHOWN = ("leaf_length", "leaf_angle", "leaf_width", "stem_diameter")
 
 
@@ -109,6 +113,46 @@ def plot_convergence(result: Fit) -> Figure:
         fontsize=11,
     )
     return figure
+
+
+def plot_segmentation(result: Segmentation, title: str = "") -> Figure:
+    """A plant's points by organ from two sides at right angles, leaves coloured and numbered by rank, cm."""
+    cloud, upright = result.cloud.points, _upright(result.up)
+    chosen = np.linspace(0, len(cloud) - 1, min(len(cloud), MOST_DRAWN)).astype(int)
+    points, labels = cloud[chosen] @ upright.T, result.labels[chosen]
+    unit = "relative length" if result.cloud.unit == "none" else "cm"
+    figure = Figure(figsize=(12.0, 7.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 2, sharey=True)
+    path = result.stem_path @ upright.T
+    for ax, (name, a, b) in zip(axes, VIEWS[:2], strict=True):
+        for label in np.unique(labels):
+            inside = points[labels == label]
+            color = UNKNOWN_COLOR if label == 0 else STEM_COLOR if label == 1 else LEAF_COLORS[(label - 2) % 7]
+            ax.scatter(inside[:, a], inside[:, b], s=1.5, c=color, linewidths=0, rasterized=True, zorder=1)
+        ax.plot(path[:, a], path[:, b], color="white", lw=1.2, zorder=3)
+        for leaf in result.leaves:
+            line = leaf.midrib @ upright.T
+            ax.plot(line[:, a], line[:, b], color="black", lw=0.6, zorder=2)
+            ax.annotate(
+                str(leaf.rank), line[-1, [a, b]], fontsize=10, ha="center", va="center", zorder=4,
+                bbox={"boxstyle": "circle,pad=0.2", "fc": "white", "ec": LEAF_COLORS[(leaf.rank - 1) % 7], "lw": 1.8},
+            )  # fmt: skip
+        ax.set_aspect("equal", adjustable="datalim")
+        ax.set(xlabel=f"across ({unit})", title=name)
+        ax.grid(alpha=0.25)
+    axes[0].set_ylabel(f"up ({unit})")
+    said = f"{len(result.leaves)} leaves, stem {result.stem_length:.1f} {unit}: black, its axis white; grey: no organ"
+    figure.suptitle("\n".join(line for line in (title, said) if line), fontsize=11)
+    return figure
+
+
+def _upright(up: FloatArray) -> FloatArray:
+    """Rotation (3, 3) that turns `up` to +z, and leaves the cloud as it is where it is that already."""
+    first = np.array([1.0, 0.0, 0.0]) if abs(up[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    across = first - (first @ up) * up
+    across = across / np.linalg.norm(across)
+    return np.stack([across, np.cross(up, across), up])
 
 
 def plot_agreement(pairs: pd.DataFrame, found: Agreement) -> Figure:

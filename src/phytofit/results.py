@@ -5,7 +5,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,23 @@ import pandas as pd
 from phytofit.cloud import PointCloud
 from phytofit.errors import OutputError
 from phytofit.fitting import Fit
+from phytofit.formats import write_cloud
 from phytofit.models import mesh
-from phytofit.plots import plot_convergence, plot_fit
+from phytofit.plots import plot_convergence, plot_fit, plot_segmentation
 from phytofit.recipe import recipe_of
+from phytofit.segmentation import Segmentation
 from phytofit.traits import Trait
 
-__all__ = ["COLUMNS", "prepare_folder", "result_names", "save_fit", "trait_table", "write_text"]
+__all__ = [
+    "COLUMNS",
+    "leaf_table",
+    "prepare_folder",
+    "result_names",
+    "save_fit",
+    "save_segmentation",
+    "trait_table",
+    "write_text",
+]
 
 COLUMNS = ["cloud", "organ", "rank", "trait", "value", "unit", "low", "high", "method", "flags"]
 DIGITS = 6  # significant, in tables; fit.json has all
@@ -79,11 +91,7 @@ def save_fit(result: Fit, cloud: PointCloud, folder: str | Path, name: str | Non
     A folder of that name from an earlier run is replaced.  model.ply is in the input's unit and frame.
     """
     name = name or cloud.name
-    folder = prepare_folder(Path(folder))
-    target = folder / name
-    part = Path(tempfile.mkdtemp(prefix=f".{name}.part-", dir=folder))
-    try:
-        part.chmod(0o755)
+    with _whole_folder(Path(folder), name) as part:
         (part / "fit.json").write_text(json.dumps(_as_json(result, cloud, name), indent=1) + "\n", encoding="utf-8")
         (part / "traits.csv").write_text(table_text(trait_table(name, result.traits)), encoding="utf-8", newline="")
         model = mesh(result.organs)
@@ -91,14 +99,64 @@ def save_fit(result: Fit, cloud: PointCloud, folder: str | Path, name: str | Non
         model.export(part / "model.ply")
         plot_fit(result, title=name).savefig(part / "fit.png", dpi=150, metadata={"Software": None})
         plot_convergence(result).savefig(part / "convergence.png", dpi=150, metadata={"Software": None})
+    return Path(folder) / name
+
+
+def save_segmentation(result: Segmentation, folder: str | Path, name: str | None = None) -> Path:
+    """Write ``folder/name/``: plant.ply, phytomers/leaf_01.ply .., leaves.csv, segmentation.png; all of them or none.
+
+    A folder of that name from an earlier run is replaced.  The clouds are in the input's unit and frame, with labels.
+    """
+    name = name or result.cloud.name
+    with _whole_folder(Path(folder), name) as part:
+        write_cloud(part / "plant.ply", result.plant)
+        (part / "phytomers").mkdir()
+        for leaf, phytomer in zip(result.leaves, result.phytomers(), strict=True):
+            write_cloud(part / "phytomers" / f"leaf_{leaf.rank:02d}.ply", phytomer)
+        (part / "leaves.csv").write_text(table_text(leaf_table(name, result)), encoding="utf-8", newline="")
+        picture = plot_segmentation(result, title=name)
+        picture.savefig(part / "segmentation.png", dpi=150, metadata={"Software": None})
+    return Path(folder) / name
+
+
+def leaf_table(name: str, result: Segmentation) -> pd.DataFrame:
+    """Tidy table of a plant's leaves, one row a leaf; lengths in cm, or relative where the cloud has no unit."""
+    unit = "rel" if result.cloud.unit == "none" else "cm"
+    rows = [
+        {
+            "cloud": name,
+            "rank": leaf.rank,
+            "label": leaf.rank + 1,
+            "azimuth_deg": leaf.azimuth,
+            f"collar_distance_{unit}": leaf.collar_distance,
+            f"collar_height_{unit}": leaf.collar_height,
+            f"length_{unit}": leaf.length,
+            "n_points": leaf.n_points,
+            "flags": "; ".join(leaf.flags),
+        }
+        for leaf in result.leaves
+    ]
+    return pd.DataFrame(rows)
+
+
+@contextmanager
+def _whole_folder(folder: Path, name: str) -> Iterator[Path]:
+    """A hidden folder to write into; when all is written it becomes ``folder/name``, in the place of an older one."""
+    folder = prepare_folder(folder)
+    target = folder / name
+    part = Path(tempfile.mkdtemp(prefix=f".{name}.part-", dir=folder))
+    try:
+        part.chmod(0o755)
+        yield part
         if target.exists():
             shutil.rmtree(target)
         part.rename(target)
+    except OutputError:
+        raise
     except OSError as error:
         raise OutputError(f"{target}: the result can't be written ({error.strerror})") from None
     finally:
         shutil.rmtree(part, ignore_errors=True)
-    return target
 
 
 def table_text(table: pd.DataFrame) -> str:

@@ -3,4 +3,4 @@
 from phytofit.segmentation.derive import SegmentedLeaf
 from phytofit.segmentation.whole import Segmentation, segment
 
-__all__ = ["SegmentedLeaf", "Segmentation", "segment"]
+__all__ = ["Segmentation", "SegmentedLeaf", "segment"]

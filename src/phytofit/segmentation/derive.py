@@ -21,11 +21,11 @@ FEW_NODES = 25  # of a leaf
 class SegmentedLeaf:
     """One leaf of a segmented plant.
 
-    ``rank`` counts from the base of the stem, from 1; its points are labelled ``rank + 1``.  ``azimuth`` is the direction
-    in which it leaves the stem, deg, counter-clockwise seen from above from the x axis (from y, where x is upright);
-    ``collar`` (3,) the place on the stem's axis, cm, ``collar_distance`` how far it is along the stem from its base and
-    ``collar_height`` how high above it, cm; ``tip`` (3,); ``midrib`` (k, 3) from the collar to the tip, ``length``
-    along it from the stem's surface, cm; ``n_points`` of the cloud.  ``flags`` are remarks in plain words.
+    ``rank`` counts from the base of the stem, from 1; its points are labelled ``rank + 1``.  ``azimuth`` is the
+    direction in which it leaves the stem, deg, counter-clockwise seen from above from the x axis (from y, where x is
+    upright); ``collar`` (3,) the place on the stem's axis, cm, ``collar_distance`` how far it is along the stem from
+    its base and ``collar_height`` how high above it, cm; ``tip`` (3,); ``midrib`` (k, 3) from the collar to the tip,
+    ``length`` along it from the stem's surface, cm; ``n_points`` of the cloud.  ``flags`` are remarks in plain words.
     """
 
     rank: int

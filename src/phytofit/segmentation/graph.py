@@ -43,7 +43,7 @@ class PlantGraph:
 
 
 def coarse(points: FloatArray) -> tuple[IntArray, IntArray]:
-    """One point a voxel of 1/600 of the cloud's size: its index, and for each point (n,) which of them stands for it."""
+    """A point a voxel of 1/600 of the cloud's size: its index, and of each point (n,) which of them stands for it."""
     edge = float(np.ptp(points, axis=0).max()) * FINE
     if edge == 0.0:
         return np.arange(1), np.zeros(len(points), np.intp)
@@ -100,9 +100,7 @@ def _shapes(points: FloatArray, neighbor: IntArray) -> tuple[FloatArray, FloatAr
     return vectors[:, :, 0], vectors[:, :, 2]
 
 
-def _bridges(
-    points: FloatArray, directions: FloatArray, piece: IntArray, large: IntArray
-) -> tuple[IntArray, IntArray]:
+def _bridges(points: FloatArray, directions: FloatArray, piece: IntArray, large: IntArray) -> tuple[IntArray, IntArray]:
     """Edges that join large pieces: of each two the shortest, and rather where one continues the other."""
     if len(large) < 2:
         return np.empty(0, np.intp), np.empty(0, np.intp)
@@ -127,8 +125,8 @@ def _bridges(
             found.append((float(cost[best]), i, names.index(b), int(u[best]), int(v[best])))
     if not found:
         return np.empty(0, np.intp), np.empty(0, np.intp)
-    cost, i, j = (np.array([f[c] for f in found]) for c in range(3))
-    tree = coo_array(minimum_spanning_tree(csr_array((cost + 1e-9, (i, j)), shape=(len(names), len(names)))))
+    costs, ends = np.array([f[0] for f in found]), np.array([f[1:3] for f in found]).T
+    tree = coo_array(minimum_spanning_tree(csr_array((costs + 1e-9, ends), shape=(len(names), len(names)))))
     kept = set(zip(tree.row.tolist(), tree.col.tolist(), strict=True))
     edges = [(u, v) for _, a, b, u, v in found if (a, b) in kept]
     return np.array([u for u, _ in edges], np.intp), np.array([v for _, v in edges], np.intp)

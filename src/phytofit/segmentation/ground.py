@@ -22,7 +22,7 @@ AXES = np.vstack([np.eye(3)[[2, 1, 0]], -np.eye(3)[[2, 1, 0]]])
 
 
 def find_ground(points: FloatArray, up: FloatArray | None) -> tuple[NDArray[np.bool_], FloatArray | None]:
-    """Which points (n, 3) are ground or pot, and the upward direction (3,) that shows it; none and `up` if there is none.
+    """Which points (n, 3) are ground or pot, and the upward direction (3,) that it shows; none and `up` if none is.
 
     up : (3,) where it is known; else the six directions of the axes are tried, as scans are made with one upright
     """

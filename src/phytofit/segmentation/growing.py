@@ -1,8 +1,8 @@
 """Organs grown from their tips towards the base of the stem.
 
 The nodes are taken in the order of their distance from the base, the farthest first.  A leaf's tip is a node with no
-neighbour taken before it; a leaf grows by what is next to it.  Where two leaves that stand out meet and stay in contact,
-they have come to what they share: the stem.  Where they soon part again, they only touched.
+neighbour taken before it; a leaf grows by what is next to it.  Where two leaves that stand out meet and stay in
+contact, they have come to what they share: the stem.  Where they soon part again, they only touched.
 """
 
 from dataclasses import dataclass, field
@@ -27,7 +27,6 @@ class Region:
     tip: int
     nodes: list[int] = field(default_factory=list)
     children: tuple[int, ...] = ()
-    parent: int = -1
     level: float = 0.0  # distance at which it was given up to its parent
 
 
@@ -36,86 +35,98 @@ def grow(graph: PlantGraph, distance: FloatArray) -> tuple[list[Region], int]:
 
     distance : (m,) of each node from the base of the stem over the surface, cm
     """
-    far = float(distance.max())
-    least, contact_length = LEAST_LENGTH * far, CONTACT * far
-    cell = graph.spacing**2
+    growth = _Growth(distance, graph.spacing**2)
     weights = graph.weights
-    indptr, indices, data = weights.indptr.tolist(), weights.indices.tolist(), weights.data.tolist()
-    d = distance.tolist()
-    regions: list[Region] = []
-    owner = [-1] * len(d)
-    into: list[int] = []  # of each region, the one it was merged into
-    met: dict[tuple[int, int], tuple[float, float]] = {}  # first and last distance of a contact
+    first, other, weight = weights.indptr.tolist(), weights.indices.tolist(), weights.data.tolist()
+    for node in np.argsort(-distance, kind="stable").tolist():
+        edges = slice(first[node], first[node + 1])
+        growth.take(node, other[edges], weight[edges])
+    return growth.regions, growth.finish(int(np.argmin(distance)))
 
-    def find(a: int) -> int:
-        while into[a] != a:
-            into[a] = into[into[a]]
-            a = into[a]
+
+class _Growth:
+    """Regions while they grow."""
+
+    def __init__(self, distance: FloatArray, cell: float) -> None:
+        far = float(distance.max())
+        self.least, self.contact = LEAST_LENGTH * far, CONTACT * far
+        self.cell = cell  # area of a node, cm2
+        self.distance: list[float] = distance.tolist()
+        self.regions: list[Region] = []
+        self.into: list[int] = []  # of each region, the one that it has become part of
+        self.owner = [-1] * len(self.distance)
+        self.met: dict[tuple[int, int], tuple[float, float]] = {}  # first and last distance of a contact
+
+    def find(self, a: int) -> int:
+        while self.into[a] != a:
+            self.into[a] = self.into[self.into[a]]
+            a = self.into[a]
         return a
 
-    def stands_out(a: int, level: float) -> bool:
-        region = regions[a]
-        if region.children:
-            return True
-        length = d[region.tip] - level
-        if length < least:
-            return False
-        return length * length >= LEAST_ELONGATION * len(region.nodes) * cell
-
-    def absorb(small: int, large: int) -> None:
-        regions[large].nodes.extend(regions[small].nodes)
-        regions[large].nodes.sort(key=lambda node: -d[node])
-        regions[small].nodes = []
-        into[small] = large
-
-    def unite(a: int, b: int, level: float) -> None:
-        joined = Region(tip=regions[a].tip if d[regions[a].tip] >= d[regions[b].tip] else regions[b].tip)
-        joined.children, joined.level = (a, b), 0.0
-        number = len(regions)
-        for child in (a, b):
-            region = regions[child]
-            below = [node for node in region.nodes if d[node] < level]
-            region.nodes = [node for node in region.nodes if d[node] >= level]
-            joined.nodes += below
-            region.parent, region.level = number, level
-            into[child] = number
-        joined.nodes.sort(key=lambda node: -d[node])
-        regions.append(joined)
-        into.append(number)
-
-    for node in np.argsort(-distance, kind="stable").tolist():
-        level = d[node]
-        best: dict[int, float] = {}
-        for e in range(indptr[node], indptr[node + 1]):
-            other = indices[e]
-            if owner[other] >= 0:
-                a = find(owner[other])
-                best[a] = min(best.get(a, np.inf), data[e])
-        if not best:
-            owner[node] = len(regions)
-            into.append(len(regions))
-            regions.append(Region(tip=node, nodes=[node]))
-            continue
-        owners = sorted(best, key=lambda a: (best[a], a))
-        strong = [a for a in owners if stands_out(a, level)]
-        keep = strong[0] if strong else max(owners, key=lambda a: (d[regions[a].tip], -a))
+    def take(self, node: int, others: list[int], weights: list[float]) -> None:
+        """Give a node to the region of its nearest neighbour that stands out; or begin a region with it."""
+        level = self.distance[node]
+        near: dict[int, float] = {}
+        for other, weight in zip(others, weights, strict=True):
+            if self.owner[other] >= 0:
+                a = self.find(self.owner[other])
+                near[a] = min(near.get(a, np.inf), weight)
+        if not near:
+            self.owner[node] = self._begin(Region(tip=node, nodes=[node]))
+            return
+        owners = sorted(near, key=lambda a: (near[a], a))
+        strong = [a for a in owners if self._stands_out(a, level)]
+        keep = strong[0] if strong else max(owners, key=lambda a: (self.distance[self.regions[a].tip], -a))
         for a in owners:
             if a != keep and a not in strong:
-                absorb(a, keep)
-        owner[node] = keep
-        regions[keep].nodes.append(node)
+                self._absorb(a, keep)
+        self.owner[node] = keep
+        self.regions[keep].nodes.append(node)
         for a in strong:
-            if a == keep or find(a) != a or find(keep) != keep:
-                continue
-            key = (min(a, keep), max(a, keep))
-            first, last = met.get(key, (level, level))
-            if last - level > 0.5 * contact_length:  # they had parted
-                first = level
-            met[key] = (first, level)
-            if first - level >= contact_length:
-                unite(*key, first)
-                keep = find(keep)
-    while alive := [(first, a, b) for (a, b), (first, _) in met.items() if find(a) != find(b)]:
-        first, a, b = max(alive)  # at the base of the stem whatever is in contact has met
-        unite(find(a), find(b), first)
-    return regions, find(owner[int(np.argmin(distance))])
+            if a != self.find(keep) and self.find(a) == a:
+                keep = self._touch(a, self.find(keep), level)
+
+    def finish(self, base: int) -> int:
+        """At the base of the stem whatever is in contact has met; the region of the node there."""
+        while pending := [(first, a, b) for (a, b), (first, _) in self.met.items() if self.find(a) != self.find(b)]:
+            first, a, b = max(pending)
+            self._unite(self.find(a), self.find(b), first)
+        return self.find(self.owner[base])
+
+    def _begin(self, region: Region) -> int:
+        self.regions.append(region)
+        self.into.append(len(self.into))
+        return len(self.into) - 1
+
+    def _stands_out(self, a: int, level: float) -> bool:
+        region = self.regions[a]
+        length = self.distance[region.tip] - level
+        slender = length * length >= LEAST_ELONGATION * len(region.nodes) * self.cell
+        return bool(region.children) or (length >= self.least and slender)
+
+    def _absorb(self, small: int, large: int) -> None:
+        self.regions[large].nodes += self.regions[small].nodes
+        self.regions[small].nodes = []
+        self.into[small] = large
+
+    def _touch(self, a: int, b: int, level: float) -> int:
+        """Note a contact of two regions; if it has lasted, they are united.  The region that b belongs to then."""
+        key = (min(a, b), max(a, b))
+        first, last = self.met.get(key, (level, level))
+        if last - level > 0.5 * self.contact:  # they had parted
+            first = level
+        self.met[key] = (first, level)
+        if first - level >= self.contact:
+            self._unite(*key, first)
+        return self.find(b)
+
+    def _unite(self, a: int, b: int, level: float) -> None:
+        """A region for what two share: what was taken since they met, and all that follows."""
+        tip = max(self.regions[a].tip, self.regions[b].tip, key=lambda node: self.distance[node])
+        number = self._begin(Region(tip=tip, children=(a, b)))
+        for child in (a, b):
+            region = self.regions[child]
+            self.regions[number].nodes += [node for node in region.nodes if self.distance[node] < level]
+            region.nodes = [node for node in region.nodes if self.distance[node] >= level]
+            region.level = level
+            self.into[child] = number

@@ -26,8 +26,8 @@ def labelled_organs(
     if cloud.labels is None or not (cloud.labels == 1).sum() >= LEAST_POINTS or not (cloud.labels > 1).any():
         found = "none" if cloud.labels is None else f"the labels {np.unique(cloud.labels).tolist()[:12]}"
         raise CloudError(
-            f"{cloud.name}: expected a point property with labels, 1 stem (at least {LEAST_POINTS} points) and 2.. leaves, "
-            f"found {found}"
+            f"{cloud.name}: expected a point property with labels, 1 stem (at least {LEAST_POINTS} points) and "
+            f"2.. leaves, found {found}"
         )
     names = np.unique(cloud.labels[cloud.labels > 1])
     used = np.flatnonzero(cloud.labels > 0)

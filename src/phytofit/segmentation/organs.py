@@ -25,7 +25,7 @@ SLICE = 2.5  # typical distances of neighbours, thickness of a section
 
 @dataclass(frozen=True)
 class Organs:
-    """The nodes' labels (m,) (1 stem, 2.. leaves, in no order), the stem's axis (k, 3) from its base, and its radius, cm.
+    """The nodes' labels (m,), 1 stem, 2.. leaves in no order; the stem's axis (k, 3) from its base; its radius, cm.
 
     ``tips`` are the leaves' tip nodes and ``levels`` the distances at which they parted from the stem, in the order of
     the labels.
@@ -98,7 +98,9 @@ def _is_stem(graph: PlantGraph, distance: FloatArray, regions: list[Region], num
         return True
     nodes = np.array(regions[number].nodes, int)
     lobes = _lobes(distance, regions, number)
-    return not lobes or (roundness(graph, distance, nodes) >= FLAT and not _lobes(distance, regions, number, SMALL_LOBE))
+    return not lobes or (
+        roundness(graph, distance, nodes) >= FLAT and not _lobes(distance, regions, number, SMALL_LOBE)
+    )
 
 
 def _lobes(distance: FloatArray, regions: list[Region], number: int, share: float = LOBE) -> list[int]:
@@ -110,7 +112,7 @@ def _lobes(distance: FloatArray, regions: list[Region], number: int, share: floa
 
 
 def _leaves_of(distance: FloatArray, regions: list[Region], number: int) -> list[tuple[list[int], int, float]]:
-    """The leaf that a region beside the stem is; or several that touch away from it, the longest with what they share."""
+    """The leaf that a region, beside the stem, is; or several that touch, the longest with what they share."""
     ends = _tips_below(regions, number)
     longest = max(ends, key=lambda e: distance[regions[e].tip])
     apart = [e for e in ends if e != longest and e not in _lobes(distance, regions, number)]
@@ -151,9 +153,7 @@ def centerline(points: FloatArray, distance: FloatArray, thickness: float) -> Fl
     return smooth
 
 
-def _axis(
-    graph: PlantGraph, distance: FloatArray, stem: IntArray
-) -> tuple[FloatArray, float, float]:
+def _axis(graph: PlantGraph, distance: FloatArray, stem: IntArray) -> tuple[FloatArray, float, float]:
     """The stem's axis and radius without the bases of leaves, and the distance beyond which it is a whorl of leaves.
 
     A stem is about as thick all along; where several leaves share what is thicker, they are rolled around each other.
@@ -163,7 +163,10 @@ def _axis(
     bands = np.unique(band)
     centers = np.array([np.median(graph.points[stem[band == b]], axis=0) for b in bands])
     spread = np.array(
-        [np.median(np.linalg.norm(graph.points[stem[band == b]] - c, axis=1)) for b, c in zip(bands, centers, strict=True)]
+        [
+            np.median(np.linalg.norm(graph.points[stem[band == b]] - c, axis=1))
+            for b, c in zip(bands, centers, strict=True)
+        ]
     )
     radius = max(float(np.quantile(spread, THIN)), 0.5 * graph.spacing)
     thin = np.flatnonzero(spread <= WHORL * radius)

@@ -1,7 +1,7 @@
 """Where the plant's stem begins: of all ends of the cloud the one from which it looks most like a plant.
 
-From the base, what the leaves share is round and straight, and the leaves part from it forwards.  From the tip of a leaf,
-the way to the other leaves begins flat, bends, and turns back at the collar.
+From the base, what the leaves share is round and straight, and the leaves part from it forwards.  From the tip of a
+leaf, the way to the other leaves begins flat, bends, and turns back at the collar.
 """
 
 from itertools import product

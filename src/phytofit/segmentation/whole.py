@@ -31,9 +31,10 @@ PIECE = 5.0  # stem radii, at least, of stem above and below a phytomer's collar
 class Segmentation:
     """A plant's points by organ, and what follows.
 
-    ``cloud`` is what was segmented, ``labels`` (n,) of its points: 0 unknown, ground or pot, 1 stem, 2.. leaves counted
-    from the base.  ``stem_path`` (k, 3) is the stem's axis from its base to the innermost leaf, ``stem_radius`` its typical
-    radius, cm; ``up`` (3,) the direction that was stated or found; ``leaves`` by rank.  ``notes`` say what was done.
+    ``cloud`` is what was segmented, ``labels`` (n,) of its points: 0 unknown, ground or pot, 1 stem, 2.. leaves
+    counted from the base.  ``stem_path`` (k, 3) is the stem's axis from its base to the innermost leaf,
+    ``stem_radius`` its typical radius, cm; ``up`` (3,) the direction that was stated or found; ``leaves`` by rank.
+    ``notes`` say what was done.
     """
 
     cloud: PointCloud
@@ -92,8 +93,8 @@ def segment(
     cloud
         One plant with stem and leaves, in any orientation; ground and pot may be below it.
     up
-        The upward direction where it is known, as for :func:`phytofit.fit`; else it is told by the plant: the stem's base
-        is the end that is round and from which the leaves part forwards.
+        The upward direction where it is known, as for :func:`phytofit.fit`; else it is told by the plant: the stem's
+        base is the end that is round and from which the leaves part forwards.
     n_nodes
         Places that the cloud is thinned to; labels are carried back to all points.
     labelled
@@ -176,7 +177,7 @@ def _found(points: FloatArray, up: FloatArray | None, n_nodes: int) -> tuple[Pla
 
 
 def _upward(path: FloatArray, up: FloatArray | None) -> FloatArray:
-    """The stated direction; else the axis that the stem rises along most nearly, if it leans little from one; else the stem."""
+    """The stated direction; else the axis of the frame that the stem hardly leans from; else the stem's own."""
     if up is not None:
         return up
     rise = path[-1] - path[0]
