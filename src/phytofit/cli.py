@@ -50,6 +50,7 @@ out = Console()
 err = Console(stderr=True)
 FIT = defaults(fit)
 SIMULATE = defaults(simulate)
+PLANT_CM = (3.0, 500.0)  # sizes that are believed of a whole plant, from the seedling on
 SHOWN = ("n", "bias", "RMSE", "R", "CCC", "covered", "flagged")  # of an agreement, on the screen
 
 
@@ -214,7 +215,7 @@ def segment_command(
     for path, name in zip(clouds, result_names(clouds), strict=True):
         try:
             with err.status(f"{name}: looking for stem and leaves"):
-                cloud = _read(path, units, labels or "label")
+                cloud = _read(path, units, labels or "label", plausible_cm=PLANT_CM)
                 result = segment(cloud, up=up, labelled=labels is not None)
                 where = save_segmentation(result, folder, name)
         except PhytofitError as error:
@@ -379,10 +380,10 @@ def recipe_command() -> None:
     out.print_json(json.dumps(recipe()))
 
 
-def _read(path: Path, units: str | None, labels: str) -> PointCloud:
+def _read(path: Path, units: str | None, labels: str, **how: Any) -> PointCloud:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they stand in the cloud's notes, which are printed
-        return read_cloud(path, units, label_property=labels)
+        return read_cloud(path, units, label_property=labels, **how)
 
 
 def _fit_with_progress(cloud: PointCloud, name: str, settings: dict[str, Any]) -> Fit:
