@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from phytofit.segmentation.graph import PlantGraph
 
-__all__ = ["Region", "grow"]
+__all__ = ["LOBE", "Region", "grow"]
 
 FloatArray = NDArray[np.float64]
 LEAST_LENGTH = 0.025  # of the greatest distance: what sticks out less is no leaf
 LEAST_ELONGATION = 0.9  # length over mean width of what sticks out: corners and lobes of a blade have less
+LOBE = 0.35  # of a leaf's length: a shorter end that parts from it away from the stem is a lobe of it
 CONTACT = 0.03  # of the greatest distance: in contact for longer, two leaves have met for good
 
 
@@ -88,10 +89,32 @@ class _Growth:
 
     def finish(self, base: int) -> int:
         """At the base of the stem whatever is in contact has met; the region of the node there."""
-        while pending := [(first, a, b) for (a, b), (first, _) in self.met.items() if self.find(a) != self.find(b)]:
+        while pending := [
+            (first, *key) for key, (first, _) in self.met.items() if self.find(key[0]) != self.find(key[1])
+        ]:
             first, a, b = max(pending)
-            self._unite(self.find(a), self.find(b), first)
+            if self._lowest(self.find(a)) < self._lowest(self.find(b)):
+                a, b = b, a
+            self._end(a, b, first)
         return self.find(self.owner[base])
+
+    def _lowest(self, a: int) -> float:
+        return min((self.distance[node] for node in self.regions[a].nodes), default=0.0)
+
+    def _end(self, met: int, other: int, level: float) -> None:
+        """Settle a contact that did not last because one of the two went no further: it is a lobe, or a leaf cut off."""
+        a, b = self.find(met), self.find(other)
+        if self.regions[a].children or self.regions[other].children or not self.regions[b].children:
+            self._unite(a, b, level)
+            return
+        whole = self.distance[self.regions[other].tip] - self.regions[other].level
+        if self.distance[self.regions[a].tip] - level < LOBE * whole:
+            self._absorb(a, other)
+            self.into[a] = b
+            return
+        self.regions[a].level = self._lowest(a)
+        number = self._begin(Region(tip=self.regions[b].tip, children=(a, b)))
+        self.into[a] = self.into[b] = number
 
     def _begin(self, region: Region) -> int:
         self.regions.append(region)

@@ -21,6 +21,7 @@ LEAST_TIP = 0.015  # of the greatest distance over the plant: what sticks out le
 APART = 0.02  # of that distance: nearer ends are one
 AROUND = 0.06  # of that distance: neighbourhood of an end, all of which lies before it
 FOOT = 0.1  # of that distance: of the stem, that must be round in any case
+LEAST_FOOT = 8  # nodes of it
 PROBE = 0.05  # of that distance: from where to where a direction is measured
 STRAIGHT_WEIGHT = 0.5  # against roundness and forwardness
 HEIGHT_WEIGHT = 3.0  # of how low an end is, where up is known
@@ -73,6 +74,8 @@ def _likeness(graph: PlantGraph, root: int) -> tuple[float, FloatArray | None]:
         return -np.inf, None
     stem = np.flatnonzero(organs.labels == 1)
     foot = stem[distance[stem] < FOOT * float(distance.max())]
+    if len(foot) < LEAST_FOOT:  # what the way begins with is so wide that it is a leaf
+        return -np.inf, None
     length = float(np.linalg.norm(np.diff(organs.path, axis=0), axis=1).sum())
     straight = float(np.linalg.norm(organs.path[-1] - organs.path[0])) / max(length, 1e-12)
     round_stem = roundness(graph, distance, foot) + roundness(graph, distance, stem)
@@ -81,7 +84,7 @@ def _likeness(graph: PlantGraph, root: int) -> tuple[float, FloatArray | None]:
     ahead = place[np.argmax(along)] - organs.path[0]
     ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-12)
     before_it = float(((graph.points[near] - graph.points[root]) @ ahead).mean()) / (AROUND * float(distance.max()))
-    at_end = min(2.0 * before_it, 1.0)  # 1 at the end of a stem, 0 in its middle
+    at_end = min(4.0 * before_it, 1.0)  # 1 at the end of a stem, 0 in its middle
     return round_stem + at_end + _forward(graph, distance, before, organs) + STRAIGHT_WEIGHT * straight, organs.path
 
 
