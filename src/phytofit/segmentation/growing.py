@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from phytofit.segmentation.graph import PlantGraph
 
-__all__ = ["LOBE", "Region", "grow"]
+__all__ = ["Region", "grow"]
 
 FloatArray = NDArray[np.float64]
 LEAST_LENGTH = 0.025  # of the greatest distance: what sticks out less is no leaf
 LEAST_ELONGATION = 0.9  # length over mean width of what sticks out: corners and lobes of a blade have less
-LOBE = 0.35  # of a leaf's length: a shorter end that parts from it away from the stem is a lobe of it
 CONTACT = 0.03  # of the greatest distance: in contact for longer, two leaves have met for good
 
 
@@ -88,33 +87,32 @@ class _Growth:
                 keep = self._touch(a, self.find(keep), level)
 
     def finish(self, base: int) -> int:
-        """At the base of the stem whatever is in contact has met; the region of the node there."""
-        while pending := [
-            (first, *key) for key, (first, _) in self.met.items() if self.find(key[0]) != self.find(key[1])
-        ]:
+        """Settle the contacts that have not lasted, as one of the two went no further; the region at the base."""
+        while True:
+            pending = [(first, a, b) for (a, b), (first, _) in self.met.items() if self.find(a) != self.find(b)]
+            if not pending:
+                return self.find(self.owner[base])
             first, a, b = max(pending)
             if self._lowest(self.find(a)) < self._lowest(self.find(b)):
                 a, b = b, a
-            self._end(a, b, first)
-        return self.find(self.owner[base])
+            self._insert(self.find(a), b, first)
 
     def _lowest(self, a: int) -> float:
         return min((self.distance[node] for node in self.regions[a].nodes), default=0.0)
 
-    def _end(self, met: int, other: int, level: float) -> None:
-        """Settle a contact that did not last because one of the two went no further: it is a lobe, or a leaf cut off."""
-        a, b = self.find(met), self.find(other)
-        if self.regions[a].children or self.regions[other].children or not self.regions[b].children:
-            self._unite(a, b, level)
+    def _insert(self, a: int, other: int, level: float) -> None:
+        """Unite a region that ended with the one that it had met, which may have become part of others since."""
+        whole = self.into[other] == other
+        lower, parents = self.regions[other].level, [r for r in self.regions if other in r.children]
+        into = self.into[other]
+        self._unite(a, other, level)
+        number = len(self.regions) - 1
+        if whole:
             return
-        whole = self.distance[self.regions[other].tip] - self.regions[other].level
-        if self.distance[self.regions[a].tip] - level < LOBE * whole:
-            self._absorb(a, other)
-            self.into[a] = b
-            return
-        self.regions[a].level = self._lowest(a)
-        number = self._begin(Region(tip=self.regions[b].tip, children=(a, b)))
-        self.into[a] = self.into[b] = number
+        self.regions[number].level = lower
+        for parent in parents:
+            parent.children = (*(child for child in parent.children if child != other), number)
+        self.into[number] = into
 
     def _begin(self, region: Region) -> int:
         self.regions.append(region)

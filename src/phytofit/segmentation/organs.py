@@ -8,12 +8,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from phytofit.segmentation.graph import PlantGraph
-from phytofit.segmentation.growing import LOBE, Region
+from phytofit.segmentation.growing import Region
 
 __all__ = ["Organs", "along_path", "centerline", "find_organs", "roundness"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+LOBE = 0.35  # of a leaf's length: a shorter end that parts from it away from the stem is a lobe of it
 SMALL_LOBE = 0.1  # of the length beyond what two ends share: so short an end is a lobe, whatever they share
 THIN = 0.3  # of the sections of what leaves share, the share that is the stem's alone for sure
 WHORL = 1.5  # times thicker than those, it is no longer stem
