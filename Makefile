@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: install demo test test-long check bench bench-accuracy docs
+.PHONY: install demo test test-long check bench bench-accuracy bench-segment docs
 
 install: .venv/installed
 
@@ -38,6 +38,9 @@ bench-accuracy: install
 	$(BIN)/python benchmarks/evidence.py
 	$(BIN)/python benchmarks/sections.py --out docs/images
 	$(BIN)/python benchmarks/accuracy.py
+
+bench-segment: install
+	$(BIN)/python benchmarks/segment.py --each
 
 docs: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'
