@@ -18,13 +18,14 @@ from phytofit.segmentation.organs import along_path, centerline
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 SAME_LENGTH = 0.08  # relative; of a leaf between two samples of the same plant
-COLLAR_CM = 2.0  # a leaf's axil, where it is seen to part, is above the place where its midrib leaves the stem's axis
+INTERNODE_CM = 12.5
+COLLAR_CM = 4.0  # a leaf's axil, where it is seen to part, is above the place where its midrib leaves the stem's axis
 AGREE = 0.97  # share of the points that get the same label in a copy of the cloud, or in one of another density
 
 
 def plant(n_leaves=5, n_points=12_000, noise_cm=0.05, seed=0, lean=0.15):
     """Points (n, 3), cm, their labels, and the leaves' azimuths and collar heights: a leaning, curved stem."""
-    height = np.linspace(0.0, 12.0 * (n_leaves + 1), 30)
+    height = np.linspace(0.0, 12.0 * n_leaves, 30)
     stem_axis = np.stack([lean * height + 0.002 * height**2, 0.0 * height, height], axis=1)
     organs = [Organ(STEM, stem_axis, frames_along(stem_axis, np.array([0.0, 1.0, 0.0])), np.full(30, 1.0))]
     azimuths, collars = [], []
@@ -64,10 +65,11 @@ def test_leaves_are_found_in_their_order(five):
         assert both / either > 0.7, label
     for leaf, azimuth, collar in zip(found.leaves, azimuths, collars, strict=True):
         assert abs((leaf.azimuth - azimuth + 180.0) % 360.0 - 180.0) < 25.0
-        assert np.linalg.norm(leaf.collar - collar) < 6.0 + COLLAR_CM
+        # the innermost leaf goes on where the stem ends: its collar is taken to be where the last other leaf parts
+        assert np.linalg.norm(leaf.collar - collar) < COLLAR_CM + (INTERNODE_CM if leaf.rank == 5 else 0.0)
         assert leaf.n_points == np.sum(found.labels == leaf.rank + 1)
         assert np.allclose(leaf.midrib[-1], leaf.tip)
-    assert np.all(np.diff([leaf.collar_distance for leaf in found.leaves]) > 0.0)
+    assert np.all(np.diff([leaf.collar_distance for leaf in found.leaves]) >= 0.0)
 
 
 def test_the_stem_is_followed_where_it_bends(five):
@@ -191,7 +193,8 @@ def test_labels_without_stem_or_leaf_are_refused(five, labels):
 
 
 def test_what_is_no_plant_is_refused(five):
-    rod = np.random.default_rng(0).normal(0.0, [0.1, 0.1, 20.0], (3000, 3))
+    angle, height = np.random.default_rng(0).uniform(0.0, 1.0, (2, 3000))
+    rod = np.stack([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle), 50.0 * height], axis=1)
     with pytest.raises(phytofit.NoStemError, match="no stem was found"):
         phytofit.segment(cloud_of(rod))
     few = phytofit.PointCloud(five[0][:20])

@@ -10,7 +10,7 @@ N_LAYERS = 80  # of the cloud's height
 LOWEST = 4  # layers that have to be spread evenly in all directions: the bottom is flat
 HIGHEST = 40  # layers: ground and pot are at most half of the cloud's height
 N_CELLS = 24  # across the foot, in which area is counted
-NECK = 0.15  # of the area of the layers below: what is above ground is narrower
+NECK = 0.15  # of the foot's area: what is just above ground is narrower
 EVEN = 0.6  # thin over wide of the foot
 N_SECTORS = 12
 LEAST_SECTORS = 10
@@ -57,13 +57,13 @@ def _ground_along(points: FloatArray, up: FloatArray) -> NDArray[np.bool_]:
         return none
     beside = np.linalg.norm(flat - center, axis=1) < BESIDE * radius
     cell = np.clip(((flat - center) / (2 * BESIDE * radius) + 0.5) * N_CELLS, 0, N_CELLS - 1).astype(int)
+    filled = np.pi * (0.5 * N_CELLS / BESIDE) ** 2
     area = np.zeros(HIGHEST)
     for i in range(HIGHEST):
         inside = beside & (layer == i)
         area[i] = len(np.unique(cell[inside] @ np.array([N_CELLS, 1])))
     for i in range(1, HIGHEST - 1):
-        below = np.median(area[:i])
-        if 0 < area[i : i + 2].max() <= NECK * below:
+        if 0 < area[i : i + 2].max() <= min(NECK * filled, 0.5 * np.median(area[:i])):
             ground = np.asarray(beside & (layer < i))
             return ground if ground.mean() >= LEAST_SHARE else none
     return none

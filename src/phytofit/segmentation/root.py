@@ -20,6 +20,8 @@ IntArray = NDArray[np.intp]
 LEAST_TIP = 0.015  # of the greatest distance over the plant: what sticks out less is not an end
 APART = 0.02  # of that distance: nearer ends are one
 AROUND = 0.06  # of that distance: neighbourhood of an end, all of which lies before it
+LEAST_BEFORE = 0.05  # of that neighbourhood's radius: how far its centre lies before an end at least
+LEAST_FORWARD = 0.2  # cosine: leaves part forwards from the way along a stem
 FOOT = 0.1  # of that distance: of the stem, that must be round in any case
 LEAST_FOOT = 8  # nodes of it
 PROBE = 0.05  # of that distance: from where to where a direction is measured
@@ -84,8 +86,11 @@ def _likeness(graph: PlantGraph, root: int) -> tuple[float, FloatArray | None]:
     ahead = place[np.argmax(along)] - organs.path[0]
     ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-12)
     before_it = float(((graph.points[near] - graph.points[root]) @ ahead).mean()) / (AROUND * float(distance.max()))
+    forward = _forward(graph, distance, before, organs)
+    if before_it < LEAST_BEFORE or forward < LEAST_FORWARD:
+        return -np.inf, None
     at_end = min(4.0 * before_it, 1.0)  # 1 at the end of a stem, 0 in its middle
-    return round_stem + at_end + _forward(graph, distance, before, organs) + STRAIGHT_WEIGHT * straight, organs.path
+    return round_stem + at_end + forward + STRAIGHT_WEIGHT * straight, organs.path
 
 
 def _forward(graph: PlantGraph, distance: FloatArray, before: IntArray, organs: Organs) -> float:
