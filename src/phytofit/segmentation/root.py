@@ -20,6 +20,7 @@ IntArray = NDArray[np.intp]
 LEAST_TIP = 0.015  # of the greatest distance over the plant: what sticks out less is not an end
 APART = 0.02  # of that distance: nearer ends are one
 AROUND = 0.06  # of that distance: neighbourhood of an end, all of which lies before it
+ONE_SIDED = 0.08  # of its radius: how far its centre lies beside an end along it
 LEAST_BEFORE = 0.05  # of that neighbourhood's radius: how far its centre lies before an end at least
 LEAST_FORWARD = 0.2  # cosine: leaves part forwards from the way along a stem
 FOOT = 0.1  # of that distance: of the stem, that must be round in any case
@@ -63,7 +64,11 @@ def _ends(graph: PlantGraph) -> list[int]:
     ends = [start, *tips_of(graph, distance, LEAST_TIP * far)]
     for direction in DIRECTIONS:
         end = int(np.argmax(graph.points @ direction))
-        if np.linalg.norm(graph.points[ends] - graph.points[end], axis=1).min() > APART * far:
+        offset = graph.points - graph.points[end]
+        around = offset[np.linalg.norm(offset, axis=1) < AROUND * far]
+        longest = np.linalg.svd(around - around.mean(axis=0), full_matrices=False)[2][0]
+        beside = abs(float(around.mean(axis=0) @ longest)) > ONE_SIDED * AROUND * far  # not in the middle of an organ
+        if beside and np.linalg.norm(offset[ends], axis=1).min() > APART * far:
             ends.append(end)
     return list(dict.fromkeys(ends))
 
