@@ -46,8 +46,9 @@ paper: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[peers]' || true
 	$(BIN)/python -m evaluation $(if $(FULL),--full)
 
-bench-reconstruct: install
+bench-segment: install
 	$(BIN)/python benchmarks/reconstruct.py
+	$(BIN)/python benchmarks/segment.py --each
 
 docs: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import phytofit
-from phytofit.dependence import width_misfit
+from phytofit.dependence import NONE, width_misfit
 from phytofit.intervals import propagated
 from phytofit.likelihood import CloudLikelihood
 
@@ -59,9 +59,9 @@ def test_width_is_as_the_model_has_it_or_it_is_not():
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
     likelihood = CloudLikelihood(species.model, species.space, points)
     state = likelihood.start(made.x, np.eye(4), 0.3)
-    assert width_misfit(likelihood, state, likelihood.evaluate(state).scores) < 0.03
+    assert width_misfit(likelihood, state, likelihood.evaluate(state).scores, NONE) < 0.03
     leaf = points[made.labels == 2]
     waved = points.copy()
     waved[made.labels == 2, 1] *= 1.0 + 0.1 * np.sqrt(2.0) * np.sin(leaf[:, 0])  # the blade lies across y
     moved = likelihood.at(waved)
-    assert width_misfit(moved, state, moved.evaluate(state).scores) == pytest.approx(0.1, abs=0.035)
+    assert width_misfit(moved, state, moved.evaluate(state).scores, NONE) == pytest.approx(0.1, abs=0.035)

@@ -11,6 +11,7 @@ from phytofit.errors import (
     CloudError,
     InputError,
     NoPhytomerError,
+    NoStemError,
     OutputError,
     PhytofitError,
     SettingError,
@@ -25,13 +26,14 @@ from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move
 from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parameters import Parameter, ParameterSpace
-from phytofit.plots import plot_convergence, plot_fit, plot_reconstruction
+from phytofit.plots import plot_convergence, plot_fit, plot_reconstruction, plot_segmentation
 from phytofit.pose import StartPose, start_poses
 from phytofit.posterior import Estimate
 from phytofit.preparation import Prepared, prepare
 from phytofit.recipe import recipe
 from phytofit.reconstruct import CAMERAS, Camera, Reconstruction, load_camera, reconstruct
-from phytofit.results import save_fit, save_reconstruction, trait_table
+from phytofit.results import leaf_table, save_fit, save_reconstruction, save_segmentation, trait_table
+from phytofit.segmentation import Segmentation, SegmentedLeaf, segment
 from phytofit.simulation import SimulatedPhytomer, add_noise, add_outliers, occlude, simulate
 from phytofit.species import Species, load_species
 from phytofit.traits import Trait, measure
@@ -51,6 +53,7 @@ __all__ = [
     "Generation",
     "InputError",
     "NoPhytomerError",
+    "NoStemError",
     "Organ",
     "OutputError",
     "PaperObjective",
@@ -63,6 +66,8 @@ __all__ = [
     "Reconstruction",
     "Reference",
     "Registration",
+    "Segmentation",
+    "SegmentedLeaf",
     "SettingError",
     "SimulatedPhytomer",
     "Species",
@@ -78,6 +83,7 @@ __all__ = [
     "compare",
     "fit",
     "from_points",
+    "leaf_table",
     "load_camera",
     "load_species",
     "mean_at",
@@ -89,6 +95,7 @@ __all__ = [
     "plot_convergence",
     "plot_fit",
     "plot_reconstruction",
+    "plot_segmentation",
     "prepare",
     "read_cloud",
     "read_measures",
@@ -98,6 +105,8 @@ __all__ = [
     "remove_outliers",
     "save_fit",
     "save_reconstruction",
+    "save_segmentation",
+    "segment",
     "simulate",
     "start_poses",
     "thin",

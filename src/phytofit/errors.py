@@ -9,6 +9,7 @@
     │   ├── SpeciesError          a species file: unknown or missing keys, impossible values
     │   └── SettingError          a setting: negative, not finite, out of its range
     ├── NoPhytomerError           the cloud was read, but holds no stem with a leaf
+    ├── NoStemError               the cloud was read, but it can't be parted into a stem and leaves
     └── OutputError               results can't be written where they were asked for
 
 Inside the fitting loop a failure is a value, :class:`Status`; at the edge of the package (reading, writing,
@@ -22,6 +23,7 @@ __all__ = [
     "CloudError",
     "InputError",
     "NoPhytomerError",
+    "NoStemError",
     "OutputError",
     "PhytofitError",
     "SettingError",
@@ -71,6 +73,10 @@ class SettingError(InputError):
 
 class NoPhytomerError(PhytofitError, ValueError):
     """The cloud was read, but no stem with a leaf on it can be found."""
+
+
+class NoStemError(PhytofitError, ValueError):
+    """A plant's cloud was read, but no stem from which leaves part can be found in it."""
 
 
 class OutputError(PhytofitError, OSError):

@@ -1,8 +1,8 @@
-"""From the images or the cloud of a plant to the traits of all its leaves: reconstruct, segment, fit, stage by stage."""
+"""From the images or the cloud of a plant to the traits of all its leaves: reconstruct, segment, fit."""
 
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from phytofit.cloud import PointCloud
-from phytofit.errors import InputError, NoPhytomerError, PhytofitError
+from phytofit.errors import CloudError, InputError, NoPhytomerError
 from phytofit.fitting import fit
 from phytofit.formats import read_cloud
 from phytofit.plots import plot_plant
@@ -25,9 +25,10 @@ from phytofit.results import (
     save_segmentation,
     table_text,
     trait_table,
+    whole_file,
     write_text,
 )
-from phytofit.segmentation import Segmentation, segment
+from phytofit.segmentation import Segmentation, SegmentedLeaf, segment
 from phytofit.species import Species, load_species
 from phytofit.traits import Trait
 
@@ -86,81 +87,108 @@ def run(
     """
     source, folder = Path(source), prepare_folder(Path(folder))
     species = species if isinstance(species, Species) else load_species(species)
-    skipped: list[str] = []
-    remarked: list[str] = []
-    cloud_file, upward = source, up
+    log = _Log([], [], told)
+    cloud_file = source
     if source.is_dir():
         if camera is None:
             raise InputError(f"{source}: a folder of depth images needs --camera: a preset, or a TOML file")
-        told("reconstruct", 0, 1)
-        images = sorted(path for path in source.glob(pattern) if path.is_file())
-        used = [*images, *(Path(given) for given in (camera, poses) if given is not None and Path(given).is_file())]
-        how = {"camera": camera, "step_deg": step_deg, "unit": unit, "pattern": pattern}
-        key = _key("reconstruct", used, how | {"poses": poses is not None})
-        target = folder / "reconstruction"
-        if _up_to_date(target, key):
-            skipped.append("reconstruct")
-        else:
-            made = reconstruct(source, camera, step_deg=step_deg, unit=unit, poses=poses, pattern=pattern)
-            save_reconstruction(made, target)
-            _done(target, key)
-        remarked += _flags_in(target / "reconstruction.json")
-        cloud_file, units, upward = target / "plant.ply", "cm", up or "z"
+        how = {"camera": camera, "step_deg": step_deg, "unit": unit, "poses": poses, "pattern": pattern}
+        cloud_file, units, up = _reconstructed(source, folder, how, log), "cm", up or "z"
     elif camera is not None:
         raise InputError(f"{source}: --camera is for a folder of depth images, and this is none")
-
-    told("segment", 0, 1)
-    cloud = read_cloud(cloud_file, units, label_property=labels or "label", plausible_cm=PLANT_CM)
-    cloud = replace(cloud, name=source.stem)
-    target = folder / "segmentation"
-    key = _key("segment", [cloud_file], {"units": units, "up": upward, "labels": labels})
-    if _up_to_date(target, key):
-        found = read_segmentation(target)
-        skipped.append("segment")
-    else:
-        found = segment(cloud, up=upward, labelled=labels is not None)
-        save_segmentation(found, folder, "segmentation")
-        _done(target, key)
-    remarked += [f"leaf {leaf.rank}: {flag}" for leaf in found.leaves for flag in leaf.flags]
-
+    found = _segmented(cloud_file, folder, source.stem, {"units": units, "up": up, "labels": labels}, log)
     tables = [trait_table(source.stem, plant_traits(found))]
-    settings = {"species": species.name, "seed": seed, "up": found.up.tolist()}
-    segmented = [target / "plant.ply", target / "segmentation.json"]
-    phytomers = found.phytomers()
-    for i, (leaf, phytomer) in enumerate(zip(found.leaves, phytomers, strict=True)):
-        told("fit", i, len(phytomers))
-        name = f"leaf_{leaf.rank:02d}"
-        key = _key(name, segmented, settings)
-        where = prepare_folder(folder / "leaves") / name
-        if _up_to_date(where, key):
-            skipped.append(name)
-        else:
-            try:
-                result = fit(phytomer, species=species, up=found.up, seed=seed, threads=threads)
-            except PhytofitError as error:
-                if not isinstance(error, NoPhytomerError | InputError):
-                    raise
-                remarked.append(f"leaf {leaf.rank}: not fitted: {error}")
-                tables.append(trait_table(source.stem, [_by_its_points(found, leaf.rank, str(error))]))
-                continue
-            save_fit(result, phytomer, folder / "leaves", name)
-            _done(where, key)
-        table = pd.read_csv(where / "traits.csv")
-        tables.append(_of_leaf(table, source.stem, leaf.rank))
-        flags = table["flags"].dropna()
-        remarked += [f"leaf {leaf.rank}: {flag}" for flag in dict.fromkeys("; ".join(flags).split("; ")) if flag]
-    told("fit", len(phytomers), len(phytomers))
-    whole = pd.concat([table for table in tables if not table.empty], ignore_index=True)
+    for i, (leaf, phytomer) in enumerate(zip(found.leaves, found.phytomers(), strict=True)):
+        told("fit", i, len(found.leaves))
+        tables.append(_fitted(found, leaf, phytomer, folder, species, {"seed": seed, "threads": threads}, log))
+    told("fit", len(found.leaves), len(found.leaves))
+    whole = pd.concat(tables, ignore_index=True)
     write_text(folder / "traits.csv", table_text(whole))
     picture = plot_plant(found, whole, title=source.stem)
-    picture.savefig(folder / "plant.png", dpi=150, metadata={"Software": None})
-    return PlantRun(whole, found, tuple(remarked), tuple(skipped))
+    with whole_file(folder / "plant.png") as part:
+        picture.savefig(part, dpi=150, format="png", metadata={"Software": None})
+    return PlantRun(whole, found, tuple(log.remarked), tuple(log.skipped))
+
+
+@dataclass(frozen=True)
+class _Log:
+    """What happens on the way."""
+
+    remarked: list[str]
+    skipped: list[str]
+    told: Told
+
+
+def _reconstructed(source: Path, folder: Path, how: Mapping[str, Any], log: _Log) -> Path:
+    """The file of the cloud that the images give."""
+    log.told("reconstruct", 0, 1)
+    images = sorted(path for path in source.glob(how["pattern"]) if path.is_file())
+    given = [Path(file) for file in (how["camera"], how["poses"]) if file is not None and Path(file).is_file()]
+    settings = {name: None if value is None else str(value) for name, value in how.items()}
+    key = _key("reconstruct", [*images, *given], settings)
+    target = folder / "reconstruction"
+    if _up_to_date(target, key):
+        log.skipped.append("reconstruct")
+    else:
+        (target / KEY).unlink(missing_ok=True)
+        save_reconstruction(reconstruct(source, **how), target)
+        _done(target, key)
+    said = json.loads((target / "reconstruction.json").read_text(encoding="utf-8"))
+    log.remarked.extend([*said["flags"], *(f"{v['file']} left out: {v['reason']}" for v in said["rejected"])])
+    return target / "plant.ply"
+
+
+def _segmented(cloud_file: Path, folder: Path, name: str, how: Mapping[str, Any], log: _Log) -> Segmentation:
+    log.told("segment", 0, 1)
+    target = folder / "segmentation"
+    labels = how["labels"]
+    cloud = read_cloud(cloud_file, how["units"], label_property=labels or "label", plausible_cm=PLANT_CM)
+    key = _key("segment", [cloud_file], how)
+    if _up_to_date(target, key):
+        found = read_segmentation(target)
+        log.skipped.append("segment")
+    else:
+        found = segment(replace(cloud, name=name), up=how["up"], labelled=labels is not None)
+        save_segmentation(found, folder, "segmentation")
+        _done(target, key)
+    log.remarked.extend(f"leaf {leaf.rank}: {flag}" for leaf in found.leaves for flag in leaf.flags)
+    return found
+
+
+def _fitted(
+    found: Segmentation,
+    leaf: SegmentedLeaf,
+    phytomer: PointCloud,
+    folder: Path,
+    species: Species,
+    how: Mapping[str, Any],
+    log: _Log,
+) -> pd.DataFrame:
+    """The traits of one leaf, by its fit; where that is refused, its length along its points."""
+    name = f"leaf_{leaf.rank:02d}"
+    target = prepare_folder(folder / "leaves") / name
+    segmented = [folder / "segmentation" / file for file in ("plant.ply", "segmentation.json")]
+    key = _key(name, segmented, {"species": repr(species), "seed": how["seed"]})
+    if _up_to_date(target, key):
+        log.skipped.append(name)
+    else:
+        try:
+            result = fit(phytomer, species=species, up=found.up, **how)
+        except (NoPhytomerError, CloudError) as error:
+            log.remarked.append(f"leaf {leaf.rank}: not fitted: {error}")
+            return trait_table(found.cloud.name, [_by_its_points(found, leaf, str(error))])
+        save_fit(result, phytomer, folder / "leaves", name)
+        _done(target, key)
+    table = pd.read_csv(target / "traits.csv")
+    flags = "; ".join(table["flags"].dropna()).split("; ")
+    log.remarked.extend(f"leaf {leaf.rank}: {flag}" for flag in dict.fromkeys(flags) if flag)
+    return _of_leaf(table, found.cloud.name, leaf.rank)
 
 
 def plant_traits(found: Segmentation) -> list[Trait]:
-    """What a segmentation tells of the plant: its height, number of leaves and phyllotaxy; and of each leaf: the height of its
-    collar above the stem's base, the distance along the stem from the collar below, its azimuth, and the angle by
-    which it diverges from the leaf below (0 to 180)."""
+    """What a segmentation tells of the plant: its height above the stem's base, how many leaves it has, and the median
+    angle by which one diverges from the one below (phyllotaxy); and of each leaf: the height of its collar above the
+    stem's base, the distance along the stem from the collar below, its azimuth, and that angle, 0 to 180 degrees."""
     unit = "rel" if found.cloud.unit == "none" else "cm"
     organs = found.cloud.points[found.labels > 0]
     height = float(((organs - found.stem_path[0]) @ found.up).max())
@@ -194,12 +222,11 @@ def _apart(a: float, b: float) -> float:
     return abs((a - b + 180.0) % 360.0 - 180.0)
 
 
-def _by_its_points(found: Segmentation, rank: int, reason: str) -> Trait:
+def _by_its_points(found: Segmentation, leaf: SegmentedLeaf, reason: str) -> Trait:
     """The length of a leaf that could not be fitted, along its points."""
-    leaf = found.leaves[rank - 1]
     unit = "rel" if found.cloud.unit == "none" else "cm"
     flags = (*leaf.flags, f"not fitted: {reason}")
-    return Trait("leaf", rank, "leaf_length", leaf.length, unit, None, None, OF_SEGMENTATION, flags)
+    return Trait("leaf", leaf.rank, "leaf_length", leaf.length, unit, None, None, OF_SEGMENTATION, flags)
 
 
 def _of_leaf(table: pd.DataFrame, name: str, rank: int) -> pd.DataFrame:
@@ -208,13 +235,13 @@ def _of_leaf(table: pd.DataFrame, name: str, rank: int) -> pd.DataFrame:
     return kept.assign(cloud=name, rank=rank, organ=kept["organ"].replace("stem", "internode"))
 
 
-def _key(stage: str, files: list[Path], settings: dict[str, Any]) -> str:
+def _key(stage: str, files: Sequence[Path], settings: Mapping[str, Any]) -> str:
     """What a stage's result follows from: version, input files by their content, settings."""
     try:
         inputs = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
     except OSError as error:
         raise InputError(f"{error.filename}: can't be read ({error.strerror})") from None
-    made = {"phytofit": version("phytofit"), "stage": stage, "inputs": inputs, "settings": settings}
+    made = {"phytofit": version("phytofit"), "stage": stage, "inputs": inputs, "settings": dict(settings)}
     return json.dumps(made, indent=1) + "\n"
 
 
@@ -228,8 +255,3 @@ def _up_to_date(folder: Path, key: str) -> bool:
 def _done(folder: Path, key: str) -> None:
     """Said last: a stage that was stopped before is done again."""
     write_text(folder / KEY, key)
-
-
-def _flags_in(file: Path) -> list[str]:
-    said = json.loads(file.read_text(encoding="utf-8"))
-    return [*said["flags"], *(f"view {view['file']} left out: {view['reason']}" for view in said["rejected"])]

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor
+from scipy.linalg import LinAlgError, cho_factor, pinvh
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
@@ -31,6 +31,7 @@ HOPELESS = 0.3  # nats for each point, by which a start is behind after the firs
 COARSE_TOLERANCE = 1.0  # nats; it is refined with all points afterwards
 START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some cm off is drawn in
 CUT_SHARES = (0.85, 0.97)  # of the midrib, from which the search for a missing tip starts; the second of rich leaves
+LEAST_KNOWN = 1e-9  # information on an entry of theta, below which it is none: labels may leave no share to be told
 DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its twelve parameters gain six by chance, and cost more
@@ -315,7 +316,8 @@ def _promise(species: Species, end: _End, cloud: _Cloud) -> float:
     state.theta[THICKNESS] = end.state.theta[THICKNESS]
     _, gradient, information = _terms(likelihood, state)
     free = np.arange(len(gradient)) != state.n_parameters  # the tip is another question
-    return 0.5 * float(gradient[free] @ np.linalg.solve(information[np.ix_(free, free)], gradient[free]))
+    inverse = pinvh(information[np.ix_(free, free)])  # with labels, points may say nothing of a share
+    return 0.5 * float(gradient[free] @ inverse @ gradient[free])
 
 
 def _cut(state: State, share: float = CUT_SHARES[0]) -> State:
@@ -371,7 +373,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     likelihood, state, free, at = end.likelihood, end.state, end.free, end.at
     k = state.n_parameters
     covariance = np.zeros((len(free), len(free)))
-    inverse = np.linalg.inv(_curvature(end))
+    inverse = pinvh(_curvature(end))
     left = max(
         dependence.n_independent - free.sum(), LEAST_LEFT * dependence.n_independent
     )  # a fit takes some errors up
@@ -408,8 +410,10 @@ def _curvature(end: _End) -> FloatArray:
     likelihood, state, at, free = end.likelihood, end.state, end.at, np.flatnonzero(end.free)
     gradient = _gradient(likelihood, state, at)[free]
     information = (at.scores.T @ at.scores + np.diag(likelihood.precision))[np.ix_(free, free)]
-    curvature = np.empty_like(information)
+    curvature = np.zeros_like(information)
     for row, i in enumerate(free):
+        if information[row, row] < LEAST_KNOWN:
+            continue
         step = STEP / np.sqrt(information[row, row])
         theta = state.theta.copy()
         theta[i] += step if theta[i] + step <= likelihood.upper[i] else -step

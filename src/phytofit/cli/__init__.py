@@ -2,12 +2,12 @@
 
 import sys
 
-from phytofit.cli import measure, reconstruct, validate
+from phytofit.cli import measure, plant, validate
 from phytofit.cli.console import app, err
 
 __all__ = ["app", "main"]
 
-COMMANDS = (measure, reconstruct, validate)  # modules that add theirs to the program when they are imported
+COMMANDS = (measure, plant, validate)  # modules that add theirs to the program when they are imported
 
 
 def main() -> None:

@@ -1,12 +1,16 @@
 """What all commands share: the program, its two streams, options, and how an error is told."""
 
+import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
+from phytofit.cloud import PointCloud
 from phytofit.errors import PhytofitError
+from phytofit.formats import read_cloud
+from phytofit.preparation import AXES
 from phytofit.species import species_names
 
 __all__ = [
@@ -18,12 +22,15 @@ __all__ = [
     "SpeciesOption",
     "SphereDiameterOption",
     "SpheresOption",
+    "UnitsOption",
+    "UpOption",
     "ViewsOption",
     "app",
     "complain",
     "err",
     "or_exit",
     "out",
+    "read_quietly",
 ]
 
 app = typer.Typer(
@@ -40,6 +47,10 @@ Seed = Annotated[int, typer.Option(help="The same seed gives the same result.", 
 SpeciesOption = Annotated[
     str, typer.Option(help=f"A species that comes with phytofit ({', '.join(species_names())}), or a TOML file.")
 ]
+UnitsOption = Annotated[
+    str | None, typer.Option("--units", "-u", help="Unit of the coordinates: cm, mm, m; none: relative lengths.")
+]
+UpOption = Annotated[str | None, typer.Option(help=f"Upward direction where it is known: {', '.join(AXES)}.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.", file_okay=True)]
 NoiseOption = Annotated[float, typer.Option(help="Gaussian noise a coordinate, cm.")]
 NoiseReachOption = Annotated[
@@ -64,3 +75,10 @@ def or_exit(call: Any) -> Any:
     except PhytofitError as error:
         complain(error)
         raise typer.Exit(2) from None
+
+
+def read_quietly(path: Path, units: str | None, labels: str, **how: Any) -> PointCloud:
+    """The cloud in a file, whose warnings stand in its notes, which are printed."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return read_cloud(path, units, label_property=labels, **how)

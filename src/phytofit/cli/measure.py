@@ -1,7 +1,6 @@
 """The commands that measure one phytomer a cloud, and those that make such clouds: fit, simulate, demo, recipe."""
 
 import json
-import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,12 +18,15 @@ from phytofit.cli.console import (
     SpeciesOption,
     SphereDiameterOption,
     SpheresOption,
+    UnitsOption,
+    UpOption,
     ViewsOption,
     app,
     complain,
     err,
     or_exit,
     out,
+    read_quietly,
 )
 from phytofit.cloud import PointCloud
 from phytofit.distances import DISTANCES
@@ -32,7 +34,7 @@ from phytofit.errors import PhytofitError, SettingError
 from phytofit.fitting import METHODS, Fit, fit
 from phytofit.formats import read_cloud, write_cloud
 from phytofit.optimize import Generation
-from phytofit.preparation import AXES, parse_up
+from phytofit.preparation import parse_up
 from phytofit.recipe import defaults, recipe
 from phytofit.results import prepare_folder, result_names, save_fit, table_text, trait_table, write_text
 from phytofit.simulation import SimulatedPhytomer, simulate
@@ -52,11 +54,9 @@ def _by_method(setting: str) -> str:
 @app.command("fit")
 def fit_command(
     clouds: Annotated[list[Path], typer.Argument(help="Point clouds: PLY, PCD, LAS/LAZ, XYZ, TXT, CSV, PTS, ASC.")],
-    units: Annotated[
-        str | None, typer.Option("--units", "-u", help="Unit of the coordinates: cm, mm, m; none: relative lengths.")
-    ] = None,
+    units: UnitsOption = None,
     species: SpeciesOption = FIT["species"],
-    up: Annotated[str | None, typer.Option(help=f"Upward direction where it is known: {', '.join(AXES)}.")] = None,
+    up: UpOption = None,
     seed_point: Annotated[
         list[str] | None,
         typer.Option(
@@ -133,7 +133,7 @@ def fit_command(
     tables = []
     for path, name in zip(clouds, result_names(clouds), strict=True):
         try:
-            cloud = _read(path, units, labels)
+            cloud = read_quietly(path, units, labels)
             result = _fit_with_progress(cloud, name, settings)
             where = save_fit(result, cloud, folder, name)
         except SettingError as error:  # as wrong for every other cloud
@@ -251,12 +251,6 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
 def recipe_command() -> None:
     """Print every setting with its default, as JSON; each result's fit.json stores its own under "settings"."""
     out.print_json(json.dumps(recipe()))
-
-
-def _read(path: Path, units: str | None, labels: str) -> PointCloud:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # they stand in the cloud's notes, which are printed
-        return read_cloud(path, units, label_property=labels)
 
 
 def _fit_with_progress(cloud: PointCloud, name: str, settings: dict[str, Any]) -> Fit:

@@ -11,7 +11,7 @@ import pandas as pd
 
 from phytofit.errors import OutputError
 
-__all__ = ["prepare_folder", "result_names", "table_text", "whole_folder", "write_text"]
+__all__ = ["prepare_folder", "result_names", "table_text", "whole_file", "whole_folder", "write_text"]
 
 DIGITS = 6  # significant, in tables; fit.json has all
 
@@ -43,15 +43,23 @@ def prepare_folder(folder: Path) -> Path:
     return folder
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a whole file or nothing."""
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A hidden file to write into, which becomes ``path`` when all is written."""
     part = path.with_name(f".{path.name}.part-{os.getpid()}")
     try:
-        part.write_text(text, encoding="utf-8", newline="")
+        yield part
         part.replace(path)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise OutputError(f"{path}: can't be written ({error.strerror})") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a whole file or nothing."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8", newline="")
 
 
 def table_text(table: pd.DataFrame) -> str:

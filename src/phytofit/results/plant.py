@@ -1,20 +1,24 @@
-"""What a reconstruction looks like on disk: plant.ply, reconstruction.json and reconstruction.png, all or none."""
+"""What a reconstruction and a segmentation look like on disk: all of it, or nothing."""
 
 import json
 import shutil
 import tempfile
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from phytofit.errors import OutputError
-from phytofit.formats import write_cloud
-from phytofit.plots import plot_reconstruction
-from phytofit.reconstruct.depth import Reconstruction
+from phytofit.errors import InputError, OutputError
+from phytofit.formats import read_cloud, write_cloud
+from phytofit.plots import plot_reconstruction, plot_segmentation
+from phytofit.reconstruct import Reconstruction
+from phytofit.results.files import table_text, whole_folder
+from phytofit.segmentation import Segmentation, SegmentedLeaf
 
-__all__ = ["save_reconstruction"]
+__all__ = ["leaf_table", "read_segmentation", "save_reconstruction", "save_segmentation"]
 
 
 def save_reconstruction(result: Reconstruction, folder: str | Path) -> Path:
@@ -97,4 +101,81 @@ def _as_json(result: Reconstruction) -> dict[str, Any]:
         "rejected": [{"file": view.file, "reason": view.reason} for view in result.rejected],
         "flags": list(result.flags),
         "settings": result.settings,
+    }
+
+
+def save_segmentation(result: Segmentation, folder: str | Path, name: str | None = None) -> Path:
+    """Write ``folder/name/``: plant.ply, phytomers/leaf_01.ply .., leaves.csv, segmentation.json and
+    segmentation.png; all of them or none.
+
+    A folder of that name from an earlier run is replaced.  The clouds are in the input's unit and frame, with labels.
+    """
+    name = name or result.cloud.name
+    with whole_folder(Path(folder), name) as part:
+        write_cloud(part / "plant.ply", result.plant)
+        (part / "phytomers").mkdir()
+        for leaf, phytomer in zip(result.leaves, result.phytomers(), strict=True):
+            write_cloud(part / "phytomers" / f"leaf_{leaf.rank:02d}.ply", phytomer)
+        (part / "leaves.csv").write_text(table_text(leaf_table(name, result)), encoding="utf-8", newline="")
+        (part / "segmentation.json").write_text(json.dumps(_segmented(result), indent=1) + "\n", encoding="utf-8")
+        picture = plot_segmentation(result, title=name)
+        picture.savefig(part / "segmentation.png", dpi=150, metadata={"Software": None})
+    return Path(folder) / name
+
+
+def leaf_table(name: str, result: Segmentation) -> pd.DataFrame:
+    """Tidy table of a plant's leaves, one row a leaf; lengths in cm, or relative where the cloud has no unit."""
+    unit = "rel" if result.cloud.unit == "none" else "cm"
+    rows = [
+        {
+            "cloud": name,
+            "rank": leaf.rank,
+            "label": leaf.rank + 1,
+            "azimuth_deg": leaf.azimuth,
+            f"collar_distance_{unit}": leaf.collar_distance,
+            f"collar_height_{unit}": leaf.collar_height,
+            f"length_{unit}": leaf.length,
+            "n_points": leaf.n_points,
+            "flags": "; ".join(leaf.flags),
+        }
+        for leaf in result.leaves
+    ]
+    return pd.DataFrame(rows)
+
+
+def read_segmentation(folder: str | Path) -> Segmentation:
+    """What :func:`save_segmentation` wrote into ``folder``; InputError if it is not there, or damaged."""
+    file = Path(folder) / "segmentation.json"
+    try:
+        said = json.loads(file.read_text(encoding="utf-8"))
+        leaves = tuple(_leaf_of(leaf) for leaf in said["leaves"])
+        path, up = np.array(said["stem_path"]), np.array(said["up"])
+        name, radius, unit, notes = said["cloud"], float(said["stem_radius"]), said["unit"], tuple(said["notes"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{file}: expected what phytofit segment writes ({type(error).__name__}: {error})") from None
+    cloud = replace(read_cloud(file.with_name("plant.ply"), unit, plausible_cm=(0.0, np.inf)), name=name)
+    assert cloud.labels is not None
+    return Segmentation(cloud, cloud.labels, path, radius, up, leaves, notes)
+
+
+def _leaf_of(said: dict[str, Any]) -> SegmentedLeaf:
+    arrays = {key: np.array(said[key]) for key in ("collar", "tip", "midrib")}
+    others: dict[str, Any] = {**said, **arrays, "flags": tuple(said["flags"])}
+    return SegmentedLeaf(**others)
+
+
+def _segmented(result: Segmentation) -> dict[str, Any]:
+    """What segmentation.json holds: all but the points, which are in plant.ply."""
+    return {
+        "phytofit": version("phytofit"),
+        "cloud": result.cloud.name,
+        "unit": result.cloud.unit,
+        "stem_path": result.stem_path.tolist(),
+        "stem_radius": result.stem_radius,
+        "up": result.up.tolist(),
+        "leaves": [
+            {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in asdict(leaf).items()}
+            for leaf in result.leaves
+        ],
+        "notes": list(result.notes),
     }

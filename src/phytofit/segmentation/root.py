@@ -1,0 +1,112 @@
+"""Where the plant's stem begins: of all ends of the cloud the one from which it looks most like a plant.
+
+From the base, what the leaves share is round and straight, and the leaves part from it forwards.  From the tip of a
+leaf, the way to the other leaves begins flat, bends, and turns back at the collar.
+"""
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phytofit.segmentation.graph import PlantGraph, geodesics, path_to_root, tips_of
+from phytofit.segmentation.growing import grow
+from phytofit.segmentation.organs import Organs, along_path, find_organs, roundness
+
+__all__ = ["find_root"]
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+LEAST_TIP = 0.015  # of the greatest distance over the plant: what sticks out less is not an end
+APART = 0.02  # of that distance: nearer ends are one
+AROUND = 0.06  # of that distance: neighbourhood of an end, all of which lies before it
+ONE_SIDED = 0.08  # of its radius: how far its centre lies beside an end along it
+LEAST_BEFORE = 0.05  # of that neighbourhood's radius: how far its centre lies before an end at least
+LEAST_FORWARD = 0.2  # cosine: leaves part forwards from the way along a stem
+FOOT = 0.1  # of that distance: of the stem, that must be round in any case
+LEAST_FOOT = 8  # nodes of it
+PROBE = 0.05  # of that distance: from where to where a direction is measured
+STRAIGHT_WEIGHT = 0.5  # against roundness and forwardness
+HEIGHT_WEIGHT = 3.0  # of how low an end is, where up is known
+DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
+
+
+def find_root(graph: PlantGraph, up: FloatArray | None) -> int | None:
+    """The node at the base of the stem; None where from no end two others can be told apart.
+
+    up : (3,) where it is known; what is high above the lowest nodes is then hardly the base
+    """
+    ends = _ends(graph)
+    low, span = 0.0, 1.0
+    height = np.zeros(len(graph.points))
+    if up is not None:
+        height = graph.points @ up
+        low, span = float(height.min()), max(float(np.ptp(height)), 1e-9)
+    best: tuple[float, int, FloatArray] | None = None
+    for end in ends:
+        likeness, path = _likeness(graph, end)
+        score = likeness - HEIGHT_WEIGHT * (height[end] - low) / span
+        if path is not None and (best is None or score > best[0]):
+            best = (score, end, path)
+    if best is None:
+        return None
+    beyond = int(np.argmax(graph.points @ (best[2][0] - best[2][-1])))  # where a leaf hides the very end
+    score = _likeness(graph, beyond)[0] - HEIGHT_WEIGHT * (height[beyond] - low) / span
+    return beyond if score > best[0] else best[1]
+
+
+def _ends(graph: PlantGraph) -> list[int]:
+    """Nodes where the cloud may end: geodesic maxima, and the farthest in all directions of space."""
+    start = int(np.argmax(np.linalg.norm(graph.points - graph.points.mean(axis=0), axis=1)))
+    start = int(np.argmax(geodesics(graph, start)[0]))
+    distance, _ = geodesics(graph, start)
+    far = float(distance.max())
+    ends = [start, *tips_of(graph, distance, LEAST_TIP * far)]
+    for direction in DIRECTIONS:
+        end = int(np.argmax(graph.points @ direction))
+        offset = graph.points - graph.points[end]
+        around = offset[np.linalg.norm(offset, axis=1) < AROUND * far]
+        longest = np.linalg.svd(around - around.mean(axis=0), full_matrices=False)[2][0]
+        beside = abs(float(around.mean(axis=0) @ longest)) > ONE_SIDED * AROUND * far  # not in the middle of an organ
+        if beside and np.linalg.norm(offset[ends], axis=1).min() > APART * far:
+            ends.append(end)
+    return list(dict.fromkeys(ends))
+
+
+def _likeness(graph: PlantGraph, root: int) -> tuple[float, FloatArray | None]:
+    """How much the plant looks like one if it stood on this node, and the axis (k, 3) that its stem then has."""
+    distance, before = geodesics(graph, root)
+    organs = find_organs(graph, distance, *grow(graph, distance))
+    if organs is None or len(organs.path) < 2:
+        return -np.inf, None
+    stem = np.flatnonzero(organs.labels == 1)
+    foot = stem[distance[stem] < FOOT * float(distance.max())]
+    if len(foot) < LEAST_FOOT:  # what the way begins with is so wide that it is a leaf
+        return -np.inf, None
+    length = float(np.linalg.norm(np.diff(organs.path, axis=0), axis=1).sum())
+    straight = float(np.linalg.norm(organs.path[-1] - organs.path[0])) / max(length, 1e-12)
+    round_stem = roundness(graph, distance, foot) + roundness(graph, distance, stem)
+    near = distance < AROUND * float(distance.max())
+    _, along, place = along_path(graph.points[near], organs.path)
+    ahead = place[np.argmax(along)] - organs.path[0]
+    ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-12)
+    before_it = float(((graph.points[near] - graph.points[root]) @ ahead).mean()) / (AROUND * float(distance.max()))
+    forward = _forward(graph, distance, before, organs)
+    if before_it < LEAST_BEFORE or forward < LEAST_FORWARD:
+        return -np.inf, None
+    at_end = min(4.0 * before_it, 1.0)  # 1 at the end of a stem, 0 in its middle
+    return round_stem + at_end + forward + STRAIGHT_WEIGHT * straight, organs.path
+
+
+def _forward(graph: PlantGraph, distance: FloatArray, before: IntArray, organs: Organs) -> float:
+    """Mean cosine of the turn that the ways to the leaves' tips make where they leave the stem."""
+    reach = PROBE * float(distance.max())
+    cosines = []
+    for tip, level in zip(organs.tips, organs.levels, strict=True):
+        path = path_to_root(before, tip)[::-1]
+        below, fork, above = np.searchsorted(distance[path], [level - reach, level, level + reach])
+        place = graph.points[[path[min(int(i), len(path) - 1)] for i in (below, fork, above)]]
+        a, b = place[1] - place[0], place[2] - place[1]
+        norm = float(np.linalg.norm(a) * np.linalg.norm(b))
+        cosines.append(float(a @ b) / norm if norm > 0 else 0.0)
+    return float(np.mean(cosines))

@@ -1,0 +1,187 @@
+"""A plant's cloud taken apart: the one function that calls all the others, and what it returns."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from phytofit.cloud import PointCloud
+from phytofit.errors import CloudError, NoStemError, SettingError
+from phytofit.preparation import parse_up
+from phytofit.segmentation.derive import SegmentedLeaf, derive_leaves
+from phytofit.segmentation.graph import PlantGraph, coarse, geodesics, plant_graph
+from phytofit.segmentation.ground import find_ground
+from phytofit.segmentation.growing import grow
+from phytofit.segmentation.labelled import labelled_organs
+from phytofit.segmentation.organs import Organs, along_path, find_organs
+from phytofit.segmentation.root import find_root
+
+__all__ = ["Segmentation", "segment"]
+
+FloatArray = NDArray[np.float64]
+MIN_POINTS = 100  # of a cloud that can be told apart
+LEAST_SETTING = 500  # nodes
+N_ROOT_NODES = 3000  # enough to see by where the stem begins
+FAR = 4.0  # typical distances of nodes, beyond which a point is nobody's
+PIECE = 5.0  # stem radii, at least, of stem above and below a phytomer's collar
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """A plant's points by organ, and what follows.
+
+    ``cloud`` is what was segmented, ``labels`` (n,) of its points: 0 unknown, ground or pot, 1 stem, 2.. leaves
+    counted from the base.  ``stem_path`` (k, 3) is the stem's axis from its base to the innermost leaf,
+    ``stem_radius`` its typical radius, cm; ``up`` (3,) the direction that was stated or found; ``leaves`` by rank.
+    ``notes`` say what was done.
+    """
+
+    cloud: PointCloud
+    labels: NDArray[np.int64]
+    stem_path: FloatArray
+    stem_radius: float
+    up: FloatArray
+    leaves: tuple[SegmentedLeaf, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def plant(self) -> PointCloud:
+        """The whole cloud with the labels; written to a file and edited, it can be given back."""
+        return replace(self.cloud, labels=self.labels)
+
+    @property
+    def stem_length(self) -> float:
+        """Along the axis, cm."""
+        return float(np.linalg.norm(np.diff(self.stem_path, axis=0), axis=1).sum())
+
+    def phytomers(self) -> list[PointCloud]:
+        """Each leaf with the piece of stem around its collar, ready for the fit: labelled 1 stem, 2 leaf.
+
+        The piece reaches half way to the collars below and above, and at least 5 stem radii.
+        """
+        on_stem = np.flatnonzero(self.labels == 1)
+        _, along, _ = along_path(self.cloud.points[on_stem], self.stem_path)
+        collars = np.array([leaf.collar_distance for leaf in self.leaves])
+        ends = np.concatenate([[-np.inf], 0.5 * (collars[1:] + collars[:-1]), [np.inf]])
+        clouds = []
+        for i, leaf in enumerate(self.leaves):
+            low = min(ends[i], collars[i] - PIECE * self.stem_radius)
+            high = max(ends[i + 1], collars[i] + PIECE * self.stem_radius)
+            blade = np.flatnonzero(self.labels == leaf.rank + 1)
+            index = np.sort(np.concatenate([blade, on_stem[(along >= low) & (along <= high)]]))
+            labels = np.where(self.labels[index] == 1, 1, 2)
+            name = f"{self.cloud.name}_leaf_{leaf.rank:02d}"
+            clouds.append(replace(self.cloud.take(index), labels=labels, name=name))
+        return clouds
+
+
+def segment(
+    cloud: PointCloud,
+    *,
+    up: str | ArrayLike | None = None,
+    n_nodes: int = 8000,
+    labelled: bool = False,
+) -> Segmentation:
+    """Take a plant's cloud apart: stem, leaves by rank, phytomers.
+
+    Distances are measured over the surface from the base of the stem; leaves are grown from their tips downwards until
+    they meet in the stem (region growing, as in section III-A of the paper, ordered by that distance).
+
+    Parameters
+    ----------
+    cloud
+        One plant with stem and leaves, in any orientation; ground and pot may be below it.
+    up
+        The upward direction where it is known, as for :func:`phytofit.fit`; else it is told by the plant: the stem's
+        base is the end that is round and from which the leaves part forwards.
+    n_nodes
+        Places that the cloud is thinned to; labels are carried back to all points.
+    labelled
+        Take stem (1) and leaves (2..) from the cloud's labels, for example after correcting them; only ranks, collars,
+        azimuths and lengths are then worked out.  Points labelled 0 stay unknown; ranks follow the collars.
+
+    Raises
+    ------
+    CloudError
+        If there are fewer than 100 points; or with `labelled`, no labels of a stem and a leaf.
+    NoStemError
+        If no two leaves part from anything that could be a stem.
+    SettingError
+        If `up` or `n_nodes` can't be used.
+    """
+    direction = parse_up(up)
+    if n_nodes < LEAST_SETTING:
+        raise SettingError(f"segment: expected n_nodes >= {LEAST_SETTING}, got {n_nodes}")
+    if len(cloud) < MIN_POINTS:
+        raise CloudError(f"{cloud.name}: found {len(cloud)} points, at least {MIN_POINTS} are needed to see a plant")
+    first, stands_for = coarse(cloud.points)
+    points = cloud.points[first]
+    notes: list[str] = []
+    if labelled:
+        graph, distance, organs, direction = labelled_organs(cloud, first, direction, n_nodes)
+        by_node = organs.labels
+    else:
+        ground, direction = find_ground(points, direction)
+        if ground.any():
+            share = 100.0 * np.bincount(stands_for[ground[stands_for]]).sum() / len(cloud)
+            notes.append(f"{share:.0f} % of the points are ground or pot")
+        above = np.flatnonzero(~ground)
+        try:
+            graph, distance, organs = _found(points[above], direction, n_nodes)
+        except NoStemError as error:
+            raise NoStemError(f"{cloud.name}: {error}") from None
+        if graph.n_bridges:
+            notes.append(f"{graph.n_bridges} gaps were bridged: the plant is in pieces")
+        by_node = organs.labels
+    upward = _upward(organs.path, direction)
+    leaves, numbers = derive_leaves(graph, distance, organs, upward)
+    ranked = np.zeros(len(organs.tips) + 2, np.int64)
+    ranked[1] = 1
+    ranked[numbers] = np.arange(2, len(numbers) + 2)
+    if labelled:
+        assert cloud.labels is not None
+        given = np.unique(cloud.labels[cloud.labels > 1])
+        table = dict(zip(given.tolist(), ranked[2:].tolist(), strict=True)) | {1: 1}
+        labels = np.array([table.get(v, 0) for v in np.unique(cloud.labels).tolist()], np.int64)[
+            np.unique(cloud.labels, return_inverse=True)[1]
+        ]
+    else:
+        of_node = ranked[by_node]
+        gap, nearest = cKDTree(graph.points).query(points, distance_upper_bound=FAR * graph.spacing)
+        of_first = np.where(np.isfinite(gap), of_node[np.minimum(nearest, len(of_node) - 1)], 0)
+        of_first[ground] = 0
+        labels = of_first[stands_for]
+    count = np.bincount(labels, minlength=len(leaves) + 2)
+    leaves = [replace(leaf, n_points=int(count[leaf.rank + 1])) for leaf in leaves]
+    n_unknown = int(count[0])
+    if n_unknown:
+        notes.append(f"{n_unknown} of {len(cloud)} points belong to no organ")
+    return Segmentation(cloud, labels, organs.path, organs.radius, upward, tuple(leaves), tuple(notes))
+
+
+def _found(points: FloatArray, up: FloatArray | None, n_nodes: int) -> tuple[PlantGraph, FloatArray, Organs]:
+    """Graph, distances from the base and organs of a plant's points."""
+    rough = plant_graph(points, min(N_ROOT_NODES, n_nodes))
+    root = find_root(rough, up)
+    if root is not None:
+        graph = plant_graph(points, n_nodes)
+        distance, _ = geodesics(graph, int(cKDTree(graph.points).query(rough.points[root])[1]))
+        organs = find_organs(graph, distance, *grow(graph, distance))
+        if organs is not None and len(organs.path) > 1:
+            return graph, distance, organs
+    raise NoStemError(
+        "no stem was found: expected at least two ends, leaves or a leaf and the stem's top, that part from a stem; "
+        "is it a whole plant, and not cut off above the stem?"
+    )
+
+
+def _upward(path: FloatArray, up: FloatArray | None) -> FloatArray:
+    """The stated direction; else the axis of the frame that the stem hardly leans from; else the stem's own."""
+    if up is not None:
+        return up
+    rise = path[-1] - path[0]
+    rise = rise / max(float(np.linalg.norm(rise)), 1e-12)
+    axis = np.zeros(3)
+    axis[int(np.argmax(np.abs(rise)))] = np.sign(rise[int(np.argmax(np.abs(rise)))])
+    return axis if rise @ axis > np.cos(np.deg2rad(30.0)) else rise

@@ -1,0 +1,159 @@
+"""A plant's cloud or images to the traits of its leaves, stage by stage, and not twice."""
+
+import json
+import shutil
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from phytofit import from_points, read_cloud, write_cloud
+from phytofit.cli import app
+from phytofit.errors import InputError
+from phytofit.pipeline import plant_traits, run
+from phytofit.results import COLUMNS, read_segmentation
+from phytofit.segmentation import segment
+from test_segmentation import leaf_axis, plant
+
+SCAN = Path(__file__).parents[1] / ".." / "shared" / "data" / "mccormick2016_turntable"
+STEM_RADIUS = 1.0  # cm, of that plant
+LENGTH = 0.15  # relative; of a leaf cut at its collar, whose stem is short
+
+
+class Known(NamedTuple):
+    """A plant's points (n, 3), and of its leaves the azimuths, deg, and the lengths from the stem's surface, cm."""
+
+    points: np.ndarray
+    azimuths: np.ndarray
+    lengths: list[float]
+
+
+def known_plant():
+    points, _, azimuths, collars = plant(n_leaves=3)
+    axes = [
+        leaf_axis(foot, np.deg2rad(azimuth), last=i == len(collars) - 1)[0]
+        for i, (foot, azimuth) in enumerate(zip(collars, azimuths, strict=True))
+    ]
+    lengths = [np.linalg.norm(np.diff(axis, axis=0), axis=1).sum() for axis in axes]
+    inside = [np.argmax(np.linalg.norm((axis - axis[0])[:, :2], axis=1) > STEM_RADIUS) for axis in axes]
+    part = [np.linalg.norm(np.diff(axis[: i + 1], axis=0), axis=1).sum() for axis, i in zip(axes, inside, strict=True)]
+    return Known(points, azimuths, [whole - hidden for whole, hidden in zip(lengths, part, strict=True)])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A plant of which all is known, as a file, and its run."""
+    folder = tmp_path_factory.mktemp("plant")
+    known = known_plant()
+    write_cloud(folder / "plant.ply", from_points(known.points, "cm"))
+    stages = []
+    result = run(folder / "plant.ply", folder / "out", units="cm", up="z", told=lambda *said: stages.append(said))
+    return folder, known, result, stages
+
+
+def test_every_leaf_has_its_traits_and_the_plant_its_own(made):
+    folder, known, _, stages = made
+    table = pd.read_csv(folder / "out" / "traits.csv")
+    assert list(table.columns) == COLUMNS
+    n = len(known.lengths)
+    assert table.loc[table["trait"] == "leaf_count", "value"].item() == n
+    lengths = table[table["trait"] == "leaf_length"].set_index("rank")["value"]
+    assert sorted(lengths.index) == list(range(1, n + 1))
+    for rank, true in enumerate(known.lengths[:-1], start=1):  # the innermost is partly in the whorl
+        assert lengths[rank] == pytest.approx(true, rel=LENGTH)
+    assert set(table["organ"]) == {"plant", "leaf", "internode"}
+    assert not (table["trait"] == "stem_length").any()  # where it was cut decides it
+    assert stages[0] == ("segment", 0, 1)
+    assert stages[-1] == ("fit", n, n)
+    assert (folder / "out" / "plant.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_is_up_to_date_is_not_done_again_and_what_changed_is(made):
+    folder, known, first, _ = made
+    out = folder / "out"
+    names = {f"leaf_{rank:02d}" for rank in range(1, len(known.lengths) + 1)}
+    fitted = {path.name for path in (out / "leaves").iterdir()}
+    again = run(folder / "plant.ply", out, units="cm", up="z")
+    assert set(again.skipped) == {"segment"} | fitted
+    assert fitted <= names
+    pd.testing.assert_frame_equal(again.table, first.table)
+    one = sorted(fitted)[0]
+    (out / "leaves" / one / "stage.json").unlink()  # as if it had been stopped there
+    assert set(run(folder / "plant.ply", out, units="cm", up="z").skipped) == {"segment"} | fitted - {one}
+    assert run(folder / "plant.ply", out, units="cm", up="z", seed=1).skipped == ("segment",)
+
+
+def test_corrected_labels_are_taken_over(made, tmp_path):
+    folder, known, _, _ = made
+    corrected = read_cloud(folder / "out" / "segmentation" / "plant.ply", "cm", plausible_cm=(0.0, 500.0))
+    last = corrected.labels.max()
+    without = corrected.take(np.flatnonzero(corrected.labels != last))
+    write_cloud(tmp_path / "corrected.ply", without)
+    result = run(tmp_path / "corrected.ply", tmp_path / "out", units="cm", up="z", labels="label")
+    assert len(result.segmentation.leaves) == len(known.lengths) - 1
+
+
+def test_a_segmentation_comes_back_as_it_was_written(made):
+    folder, _, result, _ = made
+    back = read_segmentation(folder / "out" / "segmentation")
+    mine = result.segmentation
+    np.testing.assert_array_equal(back.labels, mine.labels)
+    np.testing.assert_array_equal(back.stem_path, mine.stem_path)
+    assert [leaf.rank for leaf in back.leaves] == [leaf.rank for leaf in mine.leaves]
+    for a, b in zip(back.leaves, mine.leaves, strict=True):
+        np.testing.assert_array_equal(a.midrib, b.midrib)
+        assert (a.azimuth, a.length, a.flags) == (b.azimuth, b.length, b.flags)
+
+
+def test_a_damaged_segmentation_is_named(tmp_path):
+    (tmp_path / "segmentation.json").write_text("{}")
+    with pytest.raises(InputError, match=r"segmentation\.json: expected what phytofit segment writes"):
+        read_segmentation(tmp_path)
+
+
+def test_phyllotaxy_follows_from_azimuths():
+    """Leaves of the plant stand on alternate sides: each diverges by the angle at which it was put there."""
+    known = known_plant()
+    found = segment(from_points(known.points, "cm"), up="z")
+    traits = {(t.rank, t.name): t.value for t in plant_traits(found)}
+    for rank in range(2, len(found.leaves)):  # the innermost is partly in the whorl
+        true = abs((known.azimuths[rank - 1] - known.azimuths[rank - 2] + 180.0) % 360.0 - 180.0)
+        assert traits[rank, "divergence_angle"] == pytest.approx(true, abs=15.0)
+        assert traits[rank, "collar_distance"] == pytest.approx(
+            traits[rank, "collar_height"] - traits[rank - 1, "collar_height"], abs=1.0
+        )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["images"], "needs --camera"),
+        (["plant.ply", "--camera", "kinect-v2"], "--camera is for a folder"),
+        (["nothing.ply", "--units", "cm"], "nothing.ply"),
+        (["plant.ply"], "unit"),
+        (["images", "--camera", "kinect-v2"], "images"),
+    ],
+)
+def test_the_command_says_what_is_wrong(made, tmp_path, monkeypatch, arguments, said):
+    (tmp_path / "images").mkdir()
+    shutil.copy(made[0] / "plant.ply", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["run", *arguments, "--out", "out"])
+    assert done.exit_code == 2
+    assert "error:" in done.output
+    assert said in " ".join(done.output.split())
+    assert not (tmp_path / "out" / "traits.csv").exists()
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not SCAN.is_dir(), reason=f"{SCAN} is absent")
+def test_a_real_scan_becomes_a_table(tmp_path):
+    done = CliRunner().invoke(app, ["run", str(SCAN), "--camera", "kinect-v2", "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    table = pd.read_csv(tmp_path / "traits.csv")
+    count = table.loc[table["trait"] == "leaf_count", "value"].item()
+    assert 7 <= count <= 10  # eight in the mesh, and a small dry one
+    assert json.loads((tmp_path / "reconstruction" / "reconstruction.json").read_text())["flags"] == []
