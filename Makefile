@@ -49,6 +49,7 @@ paper: install
 bench-segment: install
 	$(BIN)/python benchmarks/reconstruct.py
 	$(BIN)/python benchmarks/segment.py --each
+	$(BIN)/python benchmarks/plants.py
 
 docs: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'

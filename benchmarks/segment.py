@@ -2,7 +2,6 @@
 
 Default settings for all clouds, in the frame they are stored in, with up not stated.  No tuning to a file: there are
 30 labelled clouds of 8 plants, and 24 of them are days of 3 plants, so shares are of clouds that are not independent.
-Published numbers are not printed: those known to us are of networks trained and tested on other parts of these sets.
 """
 
 import argparse

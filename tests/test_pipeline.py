@@ -83,7 +83,13 @@ def test_what_is_up_to_date_is_not_done_again_and_what_changed_is(made):
     one = sorted(fitted)[0]
     (out / "leaves" / one / "stage.json").unlink()  # as if it had been stopped there
     assert set(run(folder / "plant.ply", out, units="cm", up="z").skipped) == {"segment"} | fitted - {one}
-    assert run(folder / "plant.ply", out, units="cm", up="z", seed=1).skipped == ("segment",)
+
+
+@pytest.mark.long
+def test_with_another_setting_the_stages_that_follow_from_it_are_done_again(made, tmp_path):
+    shutil.copytree(made[0], tmp_path / "copy")
+    again = run(tmp_path / "copy" / "plant.ply", tmp_path / "copy" / "out", units="cm", up="z", seed=1)
+    assert again.skipped == ("segment",)
 
 
 def test_corrected_labels_are_taken_over(made, tmp_path):

@@ -98,9 +98,11 @@ def test_phytomers_are_a_leaf_and_its_piece_of_stem(five):
     phytomers = found.phytomers()
     assert len(phytomers) == 5
     for leaf, phytomer in zip(found.leaves, phytomers, strict=True):
-        assert set(np.unique(phytomer.labels)) == {1, 2}
-        assert np.sum(phytomer.labels == 2) == leaf.n_points
-        _, along, _ = along_path(phytomer.points[phytomer.labels == 1], found.stem_path)
+        assert set(np.unique(phytomer.labels)) == {0, 1, 2}
+        near = np.linalg.norm(phytomer.points - leaf.collar, axis=1) < 4.0 * found.stem_radius
+        np.testing.assert_array_equal(phytomer.labels == 0, near)  # there a leaf may hug the stem
+        assert np.sum(phytomer.labels == 2) <= leaf.n_points <= np.sum(phytomer.labels != 1)
+        _, along, _ = along_path(phytomer.points[phytomer.labels != 2], found.stem_path)
         assert along.min() < leaf.collar_distance < along.max() + 1.0
 
 

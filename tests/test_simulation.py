@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.spatial import cKDTree
 
 from phytofit.errors import SettingError
-from phytofit.models import LEAF, STEM, Phytomer, move
+from phytofit.models import LEAF, STEM, Phytomer, SurfaceSampler, move
 from phytofit.simulation import add_noise, add_outliers, occlude, random_pose, simulate, visible
 from phytofit.species import load_species
 from phytofit.traits import measure
@@ -256,7 +256,8 @@ def test_a_camera_sees_the_near_side_of_a_bare_stem(azimuth, height):
     toward = np.array([math.cos(azimuth), math.sin(azimuth), height])
     facing = points[:, :2] @ toward[:2] / radius / np.linalg.norm(toward)
     inside = (z > 4 * radius) & (z < length - 4 * radius)  # through its open ends a tube's far side is seen
-    seen = visible(points, [stem], toward)
+    surface, _ = SurfaceSampler(100_000, 0).draw([stem])
+    seen = visible(points, surface, toward)
     assert seen[inside & (facing > 0.35)].all()  # where it is more slanted a pixel reaches too deep
     assert not seen[inside & (facing < -0.5)].any()
 

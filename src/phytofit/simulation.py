@@ -1,6 +1,6 @@
 """Simulated phytomers: true organs to a cloud, with noise, removed spheres, outliers and a random pose."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,7 +93,8 @@ def simulate(
         turns = 2.0 * np.pi * (random.random() + np.arange(n_views) / n_views)
         above = np.deg2rad(CAMERA_ABOVE_DEG)
         cameras = np.stack([np.cos(above) * np.cos(turns), np.cos(above) * np.sin(turns), 0 * turns + np.sin(above)], 1)
-        seen = np.flatnonzero(np.any([visible(points, organs, toward) for toward in cameras], axis=0))[:n_points]
+        surface, _ = SurfaceSampler(SCREEN_POINTS, 0).draw(organs)
+        seen = np.flatnonzero(np.any([visible(points, surface, toward) for toward in cameras], axis=0))[:n_points]
         points, labels = points[seen], labels[seen]
     points = add_noise(points, noise_cm, random, noise_reach_cm)
     for _ in range(n_spheres):
@@ -122,10 +123,9 @@ def add_noise(points: FloatArray, std_cm: float, random: np.random.Generator, re
     return points + std_cm * np.array([white[those].sum(axis=0) / np.sqrt(len(those)) for those in near])
 
 
-def visible(points: FloatArray, organs: Sequence[Organ], toward: FloatArray) -> NDArray[np.bool_]:
-    """Mask (n,) of the points (n, 3) on the organs' surfaces that a distant camera sees, which is in the direction
-    `toward` (3,): those with nothing of the organs before them (a depth buffer, Catmull 1974)."""
-    surface, _ = SurfaceSampler(SCREEN_POINTS, 0).draw(organs)
+def visible(points: FloatArray, surface: FloatArray, toward: FloatArray) -> NDArray[np.bool_]:
+    """Mask (n,) of the points (n, 3) that a distant camera sees, which is in the direction `toward` (3,): those with
+    nothing before them of the `surface`, points (m, 3) all over it (a depth buffer, Catmull 1974)."""
     view = np.linalg.svd(toward[np.newaxis])[2]
     view[0] = toward / np.linalg.norm(toward)
     both = np.concatenate([surface, points]) @ view.T

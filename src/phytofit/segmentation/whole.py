@@ -24,6 +24,7 @@ MIN_POINTS = 100  # of a cloud that can be told apart
 LEAST_SETTING = 500  # nodes
 N_ROOT_NODES = 3000  # enough to see by where the stem begins
 FAR = 4.0  # typical distances of nodes, beyond which a point is nobody's
+DOUBTFUL = 4.0  # stem radii about a collar: there the fit is to say what is stem and what is leaf
 PIECE = 5.0  # stem radii, at least, of stem above and below a phytomer's collar
 
 
@@ -56,7 +57,8 @@ class Segmentation:
         return float(np.linalg.norm(np.diff(self.stem_path, axis=0), axis=1).sum())
 
     def phytomers(self) -> list[PointCloud]:
-        """Each leaf with the piece of stem around its collar, ready for the fit: labelled 1 stem, 2 leaf.
+        """Each leaf with the piece of stem around its collar, ready for the fit: labelled 1 stem, 2 leaf, and 0 about
+        the collar, where a leaf may hug the stem.
 
         The piece reaches half way to the collars below and above, and at least 5 stem radii.
         """
@@ -71,6 +73,8 @@ class Segmentation:
             blade = np.flatnonzero(self.labels == leaf.rank + 1)
             index = np.sort(np.concatenate([blade, on_stem[(along >= low) & (along <= high)]]))
             labels = np.where(self.labels[index] == 1, 1, 2)
+            near = np.linalg.norm(self.cloud.points[index] - leaf.collar, axis=1) < DOUBTFUL * self.stem_radius
+            labels[near] = 0
             name = f"{self.cloud.name}_leaf_{leaf.rank:02d}"
             clouds.append(replace(self.cloud.take(index), labels=labels, name=name))
         return clouds
