@@ -1,5 +1,6 @@
 """The evaluation runs, goes on where it was stopped, and its tables stand on the pages as they were written."""
 
+import ast
 import os
 import re
 import signal
@@ -11,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import stats
+
+import phytofit
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
@@ -49,6 +52,20 @@ def test_another_state_of_the_code_keeps_apart(tmp_path, monkeypatch):
     assert jobs.state_of_the_code() == before
     (tmp_path / "a.py").write_text("x = 2\n")
     assert jobs.state_of_the_code() != before
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "evaluation").glob("*.py")), ids=lambda path: path.name)
+def test_only_public_names_of_phytofit_are_used(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    modules = [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
+    modules += [alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names]
+    assert not [name for name in modules if name.startswith("phytofit.")]
+    used = {
+        n.attr
+        for n in ast.walk(tree)
+        if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name) and n.value.id == "phytofit"
+    }
+    assert used - {"__file__"} <= set(phytofit.__all__)
 
 
 @pytest.mark.parametrize("arguments", [["--quick"], ["nothing", "--out", "x"]])

@@ -229,7 +229,7 @@ class TestBadInput:
             read_views([tmp_path / "view_0.png"], scene.CAMERA)
 
     def test_a_wrong_unit(self, folder):
-        with pytest.raises(InputError, match=r"median depth .* cm if stored in m, expected 10 to 1000 cm; say --unit"):
+        with pytest.raises(InputError, match=r"median depth .* cm if stored in m, expected .* say --depth-unit"):
             phytofit.reconstruct(folder, scene.CAMERA, unit="m")
 
     def test_npy_and_tiff_are_read_like_png(self, scan, tmp_path):

@@ -22,6 +22,7 @@ __all__ = [
     "SpeciesOption",
     "SphereDiameterOption",
     "SpheresOption",
+    "ThreadsOption",
     "UnitsOption",
     "UpOption",
     "ViewsOption",
@@ -47,6 +48,7 @@ Seed = Annotated[int, typer.Option(help="The same seed gives the same result.", 
 SpeciesOption = Annotated[
     str, typer.Option(help=f"A species that comes with phytofit ({', '.join(species_names())}), or a TOML file.")
 ]
+ThreadsOption = Annotated[int | None, typer.Option(help="Threads to work with; all cores by default.")]
 UnitsOption = Annotated[
     str | None, typer.Option("--units", "-u", help="Unit of the coordinates: cm, mm, m; none: relative lengths.")
 ]

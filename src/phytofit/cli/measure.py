@@ -18,6 +18,7 @@ from phytofit.cli.console import (
     SpeciesOption,
     SphereDiameterOption,
     SpheresOption,
+    ThreadsOption,
     UnitsOption,
     UpOption,
     ViewsOption,
@@ -96,7 +97,7 @@ def fit_command(
     ] = FIT["stem_above"],
     labels: Annotated[str, typer.Option(help="Name of the label property (1 stem, 2.. leaves).")] = "label",
     seed: Seed = FIT["seed"],
-    threads: Annotated[int | None, typer.Option(help="Threads to work with; all cores by default.")] = None,
+    threads: ThreadsOption = None,
     folder: OutOption = Path("results"),
 ) -> None:
     """Measure phytomers: one leaf on its piece of stem a cloud, in any orientation.

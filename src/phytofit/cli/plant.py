@@ -14,6 +14,7 @@ from phytofit.cli.console import (
     OutOption,
     Seed,
     SpeciesOption,
+    ThreadsOption,
     UnitsOption,
     UpOption,
     app,
@@ -68,7 +69,8 @@ StepOption = Annotated[
     float | None, typer.Option(help="The turntable's nominal step, degrees; the true one is estimated either way.")
 ]
 DepthUnitOption = Annotated[
-    str | None, typer.Option("--unit", help="What a stored depth of 1 is: mm, cm or m; by default the camera's, mm.")
+    str | None,
+    typer.Option("--depth-unit", help="What a stored depth of 1 is: mm, cm or m; by default the camera's, mm."),
 ]
 PosesOption = Annotated[
     Path | None,
@@ -87,7 +89,6 @@ LabelsOption = Annotated[
         "`label` in a corrected plant.ply.",
     ),
 ]
-ThreadsOption = Annotated[int | None, typer.Option(help="Threads to work with; all cores by default.")]
 
 
 @app.command("reconstruct")

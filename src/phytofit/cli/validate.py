@@ -19,6 +19,7 @@ from phytofit.cli.console import (
     SpeciesOption,
     SphereDiameterOption,
     SpheresOption,
+    ThreadsOption,
     ViewsOption,
     app,
     complain,
@@ -66,7 +67,7 @@ def validate_command(
     within_deg: Annotated[float, typer.Option(help="How near the truth the leaf angle should be, degrees.")] = 3.0,
     species: SpeciesOption = SPECIES,
     seed: Seed = SIMULATE["seed"],
-    threads: Annotated[int | None, typer.Option(help="Threads to work with; all cores by default.")] = None,
+    threads: ThreadsOption = None,
     folder: OutOption = Path("validation"),
 ) -> None:
     """How good are the numbers: against your ruler, or in a simulation of your sensor.

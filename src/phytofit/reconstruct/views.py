@@ -65,7 +65,7 @@ def read_views(files: Sequence[Path], camera: Camera, *, unit: str | None = None
         If a file can't be read, is no depth image, has another size, or its depths are not those of a plant.
     """
     if unit is not None and unit not in ("mm", "cm", "m"):
-        raise InputError(f"--unit {unit}: expected mm, cm or m")
+        raise InputError(f"--depth-unit {unit}: expected mm, cm or m")
     step_cm = camera.step_cm if unit is None else SCALE_CM[unit]
     stored = [_stored(path) for path in files]
     shapes = [image.shape for image in stored]
@@ -125,7 +125,7 @@ def _check_range(views: Sequence[DepthView], unit: str) -> None:
     if not low <= median <= high:
         raise InputError(
             f"{views[0].file} and the others: median depth {median:.3g} cm if stored in {unit}, expected "
-            f"{low:g} to {high:g} cm; say --unit mm, cm or m"
+            f"{low:g} to {high:g} cm; say --depth-unit mm, cm or m"
         )
 
 
