@@ -34,8 +34,9 @@ def make(budget: Budget, out: Path) -> None:
     if not paths:
         return
     path = paths[0]
+    tip = phytofit.fit(read(path)).organs[1].axis[-1]
     jobs = [
-        (path, how, number, method, budget.search if method == "paper" else {})
+        (path, how, number, method, budget.search if method == "paper" else {}, tip)
         for method in ("likelihood", "paper", "without a model")
         for how in (UNTOUCHED, *WAYS)
         for number in range(1, 2 if how == UNTOUCHED else budget.copies + 1)
@@ -59,37 +60,31 @@ def corrupted(path: Path, how: str, number: int) -> tuple[np.ndarray, np.ndarray
     return points, None
 
 
-def length(path: Path, how: str, number: int, method: str, settings: dict[str, int]) -> dict[str, Any]:
-    """Leaf length of a copy, cm, from a random starting mean; NaN where none is found."""
+def length(path: Path, how: str, number: int, method: str, settings: dict[str, int], tip: np.ndarray) -> dict[str, Any]:
+    """Leaf length of a copy, cm, from a random starting mean, NaN where none is found; and whether the sphere took
+    something of the `tip` (3,), which is that of the untouched leaf."""
     points, center = corrupted(path, how, number)
-    row: dict[str, Any] = {"method": method, "how": how, "copy": number, "low": np.nan, "high": np.nan, "flags": ""}
+    taken = center is not None and bool(np.linalg.norm(center - tip) < TIP_CM)
+    row: dict[str, Any] = {"method": method, "how": how, "copy": number, "tip_taken": taken}
+    row |= {"leaf_length": np.nan, "low": np.nan, "high": np.nan, "flags": ""}
     try:
         if method == "without a model":
-            return row | {"leaf_length": model_free.measure(points)["leaf_length"], "tip_taken": False}
+            return row | {"leaf_length": model_free.measure(points)["leaf_length"]}
         start = {} if how == UNTOUCHED else {"random_start": True, "seed": number}
         result = phytofit.fit(points, "cm", method=method, threads=1, **start, **settings)
     except phytofit.NoPhytomerError:
-        return row | {"leaf_length": np.nan, "tip_taken": False}
+        return row
     found = next(t for t in result.traits if t.name == "leaf_length")
-    near = center is not None and bool(np.linalg.norm(center - result.organs[1].axis[-1]) < TIP_CM)
     ends = [np.nan if end is None else end for end in (found.low, found.high)]
-    return row | {
-        "leaf_length": found.value,
-        "low": ends[0],
-        "high": ends[1],
-        "flags": "; ".join(result.flags),
-        "tip_taken": near,
-    }
+    return row | {"leaf_length": found.value, "low": ends[0], "high": ends[1], "flags": "; ".join(result.flags)}
 
 
 def summary(table: pd.DataFrame, out: Path) -> None:
-    tips = table[(table["method"] == "likelihood") & table["tip_taken"]]
-    taken = set(zip(tips["how"], tips["copy"], strict=True))
     rows = []
     for method, mine in table.groupby("method", sort=False):
         untouched = mine.loc[mine["how"] == UNTOUCHED, "leaf_length"].item()
         for how, what in WAYS.items():
-            those = mine[(mine["how"] == how) & ~mine["copy"].map(lambda n, how=how: (how, n) in taken)]
+            those = mine[(mine["how"] == how) & ~mine["tip_taken"]]
             off = (those["leaf_length"] - untouched).abs()
             found = off[off.notna()]
             rows.append(
@@ -223,8 +218,12 @@ def compared(method: str, way: str, number: int, settings: dict[str, int]) -> di
     noise, spheres = SIMULATED[way]
     made = phytofit.simulate(noise_cm=noise, n_spheres=spheres, seed=500_000 + number)
     true = {t.name: t.value for t in phytofit.measure(made.organs)}
-    if method == "without a model":
-        found = model_free.measure(made.points)
-    else:
-        found = {t.name: t.value for t in phytofit.fit(made.points, "cm", method=method, threads=1, **settings).traits}
+    try:
+        if method == "without a model":
+            found = model_free.measure(made.points)
+        else:
+            result = phytofit.fit(made.points, "cm", method=method, threads=1, **settings)
+            found = {t.name: t.value for t in result.traits}
+    except phytofit.NoPhytomerError:
+        found = dict.fromkeys(true, np.nan)
     return {"way": way, "method": method, "number": number} | {name: found[name] - true[name] for name in found}

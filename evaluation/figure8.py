@@ -40,7 +40,8 @@ def make(budget: Budget, out: Path) -> None:
             continue
         for ax, name in zip(axes[1], SHOWN, strict=True):
             those = real[(real["method"] == method) & (real["trait"] == name)]
-            ends = [(those["value"] - those["low"]).fillna(0.0), (those["high"] - those["value"]).fillna(0.0)]
+            ends = [those["value"] - those["low"], those["high"] - those["value"]]
+            ends = [end.fillna(0.0).clip(lower=0.0) for end in ends]
             ax.errorbar(
                 those["measured"],
                 those["value"],

@@ -14,10 +14,12 @@ def fill(out: Path, pages: tuple[Path, ...] = PAGES) -> None:
 
 
 def filled(text: str, out: Path) -> str:
-    """The text with each marked place holding the Markdown file of its name."""
+    """The text with each marked place holding the Markdown file of its name, if there is one."""
 
     def put(match: re.Match[str]) -> str:
-        table = (out / f"{match[1]}.md").read_text(encoding="utf-8").strip()
-        return f"<!-- {match[1]} -->\n{table}\n<!-- end -->"
+        file = out / f"{match[1]}.md"
+        if not file.is_file():  # it rests on data that are absent
+            return match[0]
+        return f"<!-- {match[1]} -->\n{file.read_text(encoding='utf-8').strip()}\n<!-- end -->"
 
     return re.sub(r"<!-- (\w+) -->\n.*?<!-- end -->", put, text, flags=re.DOTALL)

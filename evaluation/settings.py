@@ -13,7 +13,6 @@ SPECIES = phytofit.load_species()
 COLORS = {"likelihood": "#0072B2", "paper": "#D55E00", "without a model": "#7F7F7F", "truth": "#000000"}
 MARKERS = {"likelihood": "o", "paper": "s", "without a model": "^"}
 NAMES = {"likelihood": "phytofit (default)", "paper": "the paper's method", "without a model": "without a model"}
-DPI = 110
 
 
 class Budget(NamedTuple):

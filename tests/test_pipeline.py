@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from phytofit import from_points, read_cloud, write_cloud
 from phytofit.cli import app
-from phytofit.errors import InputError
+from phytofit.errors import InputError, OutputError
 from phytofit.pipeline import plant_traits, run
 from phytofit.results import COLUMNS, read_segmentation
 from phytofit.segmentation import segment
@@ -85,6 +85,29 @@ def test_what_is_up_to_date_is_not_done_again_and_what_changed_is(made):
     assert set(run(folder / "plant.ply", out, units="cm", up="z").skipped) == {"segment"} | fitted - {one}
 
 
+def test_what_is_damaged_is_made_again_and_what_was_edited_is_not_lost(made, tmp_path):
+    folder = tmp_path / "copy"
+    shutil.copytree(made[0], folder)
+    out = folder / "out"
+    (out / "leaves" / "leaf_01" / "traits.csv").unlink()
+    assert "leaf_01" not in run(folder / "plant.ply", out, units="cm", up="z").skipped
+    cloud = out / "segmentation" / "plant.ply"
+    edited = read_cloud(cloud, "cm", plausible_cm=(0.0, 500.0))
+    write_cloud(cloud, edited.take(np.arange(len(edited) - 1)))
+    before = cloud.read_bytes()
+    with pytest.raises(InputError, match="--labels label"):
+        run(folder / "plant.ply", out, units="cm", up="z")
+    assert cloud.read_bytes() == before
+
+
+def test_results_never_replace_what_is_not_theirs(made, tmp_path):
+    (tmp_path / "out" / "segmentation").mkdir(parents=True)
+    (tmp_path / "out" / "segmentation" / "precious.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"no segmentation\.json of an earlier run"):
+        run(made[0] / "plant.ply", tmp_path / "out", units="cm", up="z")
+    assert (tmp_path / "out" / "segmentation" / "precious.txt").read_text() == "mine"
+
+
 @pytest.mark.long
 def test_with_another_setting_the_stages_that_follow_from_it_are_done_again(made, tmp_path):
     shutil.copytree(made[0], tmp_path / "copy")
@@ -141,10 +164,13 @@ def test_phyllotaxy_follows_from_azimuths():
         (["nothing.ply", "--units", "cm"], "nothing.ply"),
         (["plant.ply"], "unit"),
         (["images", "--camera", "kinect-v2"], "images"),
+        (["images", "--camera", "kinect-v2", "--pattern", "/x/*.png"], "--pattern"),
+        (["out", "--camera", "kinect-v2"], "can't hold the results"),
     ],
 )
 def test_the_command_says_what_is_wrong(made, tmp_path, monkeypatch, arguments, said):
     (tmp_path / "images").mkdir()
+    (tmp_path / "out").mkdir()
     shutil.copy(made[0] / "plant.ply", tmp_path)
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(app, ["run", *arguments, "--out", "out"])

@@ -62,8 +62,14 @@ def test_enough_is_from_where_on_nine_of_ten_are_near():
 
 
 def test_a_cloud_that_can_not_be_fitted_is_counted_and_named():
-    none = trial({"n_points": 120, "noise_cm": 8.0}, number=3, seed=1)
-    assert len(none.comparison.unmatched) + none.comparison.pairs["cloud"].nunique() == 3
+    made = trial({"n_points": 400, "n_spheres": 3, "sphere_diameter_cm": 40.0}, number=4, seed=1)
+    assert made.comparison.unmatched
+    assert all("remove all" in text or "points" in text for text in made.comparison.unmatched)
+    assert len(made.comparison.unmatched) + made.comparison.pairs["cloud"].nunique() == 4
+    none = Trial(Comparison(pd.DataFrame(columns=PAIR_COLUMNS), ("p0: no stem",)), 1, {})
+    table = trial_table("points", {5: none}, 5.0, 3.0)
+    assert table["refused"].tolist() == [1] * len(MAIN_TRAITS)
+    assert table["within"].tolist() == [0.0] * len(MAIN_TRAITS)
 
 
 @pytest.mark.long

@@ -12,6 +12,7 @@ from phytofit.cli import app
 from phytofit.errors import InputError
 from phytofit.validation import agreement, compare, concordance, read_measures, read_results
 
+LEAVES = ((1, 20.0), (2, 30.0), (3, 40.0))  # ranks, and lengths in cm
 RESULT = "cloud,organ,rank,trait,value,unit,low,high,method,flags\n"
 ROUNDING = 1e-9
 
@@ -47,7 +48,7 @@ def measures_of(rows):
 def test_columns_as_people_name_them(tmp_path, header, row, value):
     table = read_measures(written(tmp_path, f"{header}\n{row}\n"))
     assert table.to_dict("records") == [
-        {"cloud": "a", "trait": "leaf_length", "value": pytest.approx(value), "unit": "cm"}
+        {"cloud": "a", "rank": "", "trait": "leaf_length", "value": pytest.approx(value), "unit": "cm"}
     ]
 
 
@@ -190,3 +191,14 @@ def test_the_command_says_what_is_wrong(tmp_path, results, said):
     assert done.exit_code == 2
     assert said in " ".join(done.output.split())
     assert not (tmp_path / "v").exists()
+
+
+def test_leaves_of_a_plant_are_told_apart_by_their_rank(tmp_path):
+    results = pd.concat([results_of([("p", "leaf_length", v, v - 1.0, v + 1.0)]).assign(rank=i) for i, v in LEAVES])
+    text = "plant,rank,leaf_length_cm\np,1,20.5\np,3,39.0\np,4,50\n"
+    comparison = compare(read_measures(written(tmp_path, text)), results)
+    assert comparison.pairs["value"].tolist() == [20.0, 40.0]
+    assert comparison.pairs["cloud"].tolist() == ["p leaf 1", "p leaf 3"]
+    assert "measured, no result: p leaf 4, leaf_length" in comparison.unmatched
+    with pytest.raises(InputError, match="of 3 leaves; expected a column rank"):
+        compare(read_measures(written(tmp_path, "plant,leaf_length_cm\np,20\n")), results)

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import shutil
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
@@ -16,7 +18,7 @@ from phytofit.errors import CloudError, InputError, NoPhytomerError
 from phytofit.fitting import fit
 from phytofit.formats import read_cloud
 from phytofit.plots import plot_plant
-from phytofit.reconstruct import reconstruct
+from phytofit.reconstruct import depth_files, reconstruct
 from phytofit.results import (
     prepare_folder,
     read_segmentation,
@@ -43,12 +45,13 @@ Told = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class PlantRun:
-    """What became of a plant: ``table`` of its traits (the columns of ``traits.csv``), its ``segmentation``, what was
-    ``remarked`` in plain words, and which stages were ``skipped``, being up to date."""
+    """What became of a plant: ``table`` of its traits (the columns of ``traits.csv``), its ``segmentation``, ``flags``
+    in plain words, ``notes`` on what was done to the cloud, and which stages were ``skipped``, being up to date."""
 
     table: pd.DataFrame
     segmentation: Segmentation
-    remarked: tuple[str, ...]
+    flags: tuple[str, ...]
+    notes: tuple[str, ...]
     skipped: tuple[str, ...]
 
 
@@ -85,9 +88,12 @@ def run(
     Raises InputError and NoStemError where nothing can be measured.  A leaf whose fit is refused keeps what its
     segmentation tells.
     """
-    source, folder = Path(source), prepare_folder(Path(folder))
+    source, folder = Path(source), Path(folder)
+    if source.is_dir() and source.resolve() == folder.resolve():
+        raise InputError(f"{folder}: the folder of the images can't hold the results; name another with --out")
+    folder, name = prepare_folder(folder), source.resolve().stem if source.is_file() else source.resolve().name
     species = species if isinstance(species, Species) else load_species(species)
-    log = _Log([], [], told)
+    log = _Log([], [], [], told)
     cloud_file = source
     if source.is_dir():
         if camera is None:
@@ -96,25 +102,28 @@ def run(
         cloud_file, units, up = _reconstructed(source, folder, how, log), "cm", up or "z"
     elif camera is not None:
         raise InputError(f"{source}: --camera is for a folder of depth images, and this is none")
-    found = _segmented(cloud_file, folder, source.stem, {"units": units, "up": up, "labels": labels}, log)
-    tables = [trait_table(source.stem, plant_traits(found))]
+    found = _segmented(cloud_file, folder, {"name": name, "units": units, "up": up, "labels": labels}, log)
+    tables = [trait_table(name, plant_traits(found))]
     for i, (leaf, phytomer) in enumerate(zip(found.leaves, found.phytomers(), strict=True)):
         told("fit", i, len(found.leaves))
         tables.append(_fitted(found, leaf, phytomer, folder, species, {"seed": seed, "threads": threads}, log))
     told("fit", len(found.leaves), len(found.leaves))
+    for old in sorted((folder / "leaves").glob("leaf_*"))[len(found.leaves) :]:
+        shutil.rmtree(old)  # of an earlier run that saw more leaves
     whole = pd.concat(tables, ignore_index=True)
     write_text(folder / "traits.csv", table_text(whole))
-    picture = plot_plant(found, whole, title=source.stem)
+    picture = plot_plant(found, whole, title=name)
     with whole_file(folder / "plant.png") as part:
         picture.savefig(part, dpi=150, format="png", metadata={"Software": None})
-    return PlantRun(whole, found, tuple(log.remarked), tuple(log.skipped))
+    return PlantRun(whole, found, tuple(log.flags), tuple(log.notes), tuple(log.skipped))
 
 
 @dataclass(frozen=True)
 class _Log:
     """What happens on the way."""
 
-    remarked: list[str]
+    flags: list[str]
+    notes: list[str]
     skipped: list[str]
     told: Told
 
@@ -122,7 +131,7 @@ class _Log:
 def _reconstructed(source: Path, folder: Path, how: Mapping[str, Any], log: _Log) -> Path:
     """The file of the cloud that the images give."""
     log.told("reconstruct", 0, 1)
-    images = sorted(path for path in source.glob(how["pattern"]) if path.is_file())
+    images = depth_files(source, how["pattern"])
     given = [Path(file) for file in (how["camera"], how["poses"]) if file is not None and Path(file).is_file()]
     settings = {name: None if value is None else str(value) for name, value in how.items()}
     key = _key("reconstruct", [*images, *given], settings)
@@ -132,26 +141,34 @@ def _reconstructed(source: Path, folder: Path, how: Mapping[str, Any], log: _Log
     else:
         (target / KEY).unlink(missing_ok=True)
         save_reconstruction(reconstruct(source, **how), target)
-        _done(target, key)
+        _done(target, key, ("plant.ply", "reconstruction.json"))
     said = json.loads((target / "reconstruction.json").read_text(encoding="utf-8"))
-    log.remarked.extend([*said["flags"], *(f"{v['file']} left out: {v['reason']}" for v in said["rejected"])])
+    log.flags.extend([*said["flags"], *(f"{v['file']} left out: {v['reason']}" for v in said["rejected"])])
     return target / "plant.ply"
 
 
-def _segmented(cloud_file: Path, folder: Path, name: str, how: Mapping[str, Any], log: _Log) -> Segmentation:
+def _segmented(cloud_file: Path, folder: Path, how: Mapping[str, Any], log: _Log) -> Segmentation:
     log.told("segment", 0, 1)
     target = folder / "segmentation"
     labels = how["labels"]
-    cloud = read_cloud(cloud_file, how["units"], label_property=labels or "label", plausible_cm=PLANT_CM)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # they stand in the cloud's notes
+        cloud = read_cloud(cloud_file, how["units"], label_property=labels or "label", plausible_cm=PLANT_CM)
     key = _key("segment", [cloud_file], how)
+    if _same_but_edited(target, key, "plant.ply"):
+        raise InputError(
+            f"{target / 'plant.ply'}: it was changed since it was written; to use its labels run on that file with "
+            f"--labels label and another --out, or delete {target} to begin anew"
+        )
     if _up_to_date(target, key):
         found = read_segmentation(target)
         log.skipped.append("segment")
     else:
-        found = segment(replace(cloud, name=name), up=how["up"], labelled=labels is not None)
+        found = segment(replace(cloud, name=how["name"]), up=how["up"], labelled=labels is not None)
         save_segmentation(found, folder, "segmentation")
-        _done(target, key)
-    log.remarked.extend(f"leaf {leaf.rank}: {flag}" for leaf in found.leaves for flag in leaf.flags)
+        _done(target, key, ("plant.ply", "segmentation.json"))
+    log.notes.extend([*cloud.notes, *found.notes])
+    log.flags.extend(f"leaf {leaf.rank}: {flag}" for leaf in found.leaves for flag in leaf.flags)
     return found
 
 
@@ -175,13 +192,13 @@ def _fitted(
         try:
             result = fit(phytomer, species=species, up=found.up, **how)
         except (NoPhytomerError, CloudError) as error:
-            log.remarked.append(f"leaf {leaf.rank}: not fitted: {error}")
+            log.flags.append(f"leaf {leaf.rank}: not fitted: {error}")
             return trait_table(found.cloud.name, [_by_its_points(found, leaf, str(error))])
         save_fit(result, phytomer, folder / "leaves", name)
-        _done(target, key)
+        _done(target, key, ("traits.csv",))
     table = pd.read_csv(target / "traits.csv")
     flags = "; ".join(table["flags"].dropna()).split("; ")
-    log.remarked.extend(f"leaf {leaf.rank}: {flag}" for flag in dict.fromkeys(flags) if flag)
+    log.flags.extend(f"leaf {leaf.rank}: {flag}" for flag in dict.fromkeys(flags) if flag)
     return _of_leaf(table, found.cloud.name, leaf.rank)
 
 
@@ -237,21 +254,41 @@ def _of_leaf(table: pd.DataFrame, name: str, rank: int) -> pd.DataFrame:
 
 def _key(stage: str, files: Sequence[Path], settings: Mapping[str, Any]) -> str:
     """What a stage's result follows from: version, input files by their content, settings."""
-    try:
-        inputs = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-    except OSError as error:
-        raise InputError(f"{error.filename}: can't be read ({error.strerror})") from None
-    made = {"phytofit": version("phytofit"), "stage": stage, "inputs": inputs, "settings": dict(settings)}
-    return json.dumps(made, indent=1) + "\n"
+    inputs = {path.name: _hash(path) for path in files}
+    return json.dumps({"phytofit": version("phytofit"), "stage": stage, "inputs": inputs, "settings": dict(settings)})
 
 
 def _up_to_date(folder: Path, key: str) -> bool:
+    """Whether the folder holds what a stage with this key made, unchanged."""
+    made = _made(folder, key)
+    return made is not None and all(_hash(folder / name) == was for name, was in made.items())
+
+
+def _same_but_edited(folder: Path, key: str, name: str) -> bool:
+    """Whether of what a stage with this key made this file was changed, not deleted."""
+    made = _made(folder, key)
+    return made is not None and _hash(folder / name) not in (None, made[name])
+
+
+def _made(folder: Path, key: str) -> dict[str, str] | None:
+    """Names and hashes of what the folder's stage made, if it had this key."""
     try:
-        return (folder / KEY).read_text(encoding="utf-8") == key
+        said = json.loads((folder / KEY).read_text(encoding="utf-8"))
+        made: dict[str, str] = said.pop("made")
+    except (OSError, ValueError, KeyError):
+        return None
+    return made if json.dumps(said) == json.dumps(json.loads(key)) else None
+
+
+def _done(folder: Path, key: str, made: Sequence[str]) -> None:
+    """Said last, so that a stage that was stopped before is done again."""
+    said = json.loads(key) | {"made": {name: _hash(folder / name) for name in made}}
+    write_text(folder / KEY, json.dumps(said, indent=1) + "\n")
+
+
+def _hash(path: Path) -> str | None:
+    """SHA-256 of a file; None if it can't be read."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError:
-        return False
-
-
-def _done(folder: Path, key: str) -> None:
-    """Said last: a stage that was stopped before is done again."""
-    write_text(folder / KEY, key)
+        return None

@@ -405,8 +405,8 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
 
 
 def _curvature(end: _End) -> FloatArray:
-    """Second derivatives of the error by the free entries of theta, by differences of the gradient; the information
-    where they are not positive definite."""
+    """Second derivatives of the error by the free entries of theta, by differences of the gradient, 0 for those of
+    which nothing is known; the information where they are not positive definite."""
     likelihood, state, at, free = end.likelihood, end.state, end.at, np.flatnonzero(end.free)
     gradient = _gradient(likelihood, state, at)[free]
     information = (at.scores.T @ at.scores + np.diag(likelihood.precision))[np.ix_(free, free)]
@@ -422,7 +422,8 @@ def _curvature(end: _End) -> FloatArray:
         curvature[row] = change / (theta[i] - state.theta[i])
     curvature = 0.5 * (curvature + curvature.T)
     try:
-        cho_factor(curvature)
+        known = np.diag(information) >= LEAST_KNOWN
+        cho_factor(curvature[np.ix_(known, known)])
     except LinAlgError:
         return information
     return curvature

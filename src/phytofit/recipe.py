@@ -8,11 +8,13 @@ from phytofit.cloud import remove_outliers, thin
 from phytofit.distances import chamfer, hausdorff, labelled_hausdorff, quantile_hausdorff
 from phytofit.fitting import Fit, fit, fit_likelihood, fit_paper
 from phytofit.objectives import PaperObjective
+from phytofit.reconstruct import reconstruct
 from phytofit.segmentation import segment
 
 __all__ = ["defaults", "recipe", "recipe_of"]
 
 STEPS: dict[str, Callable[..., Any]] = {
+    "reconstruct": reconstruct,
     "segment": segment,
     "fit": fit,
     "method_likelihood": fit_likelihood,
@@ -46,6 +48,6 @@ def recipe() -> dict[str, dict[str, Any]]:
 
 def recipe_of(result: Fit) -> dict[str, dict[str, Any]]:
     """The recipe that made this result."""
-    made = {step: settings for step, settings in recipe().items() if step != "segment"}
+    made = {step: settings for step, settings in recipe().items() if step not in ("reconstruct", "segment")}
     made["fit"] |= {"species": result.species.name, "seed": result.seed, **result.settings}
     return made

@@ -18,6 +18,7 @@ CAMERA_ABOVE_DEG = 20.0  # the cameras of `n_views` are so much above the horizo
 SPARE = 8  # times as many points are drawn as cameras are to see
 SCREEN_POINTS, PIXEL_CM = 250_000, 0.1  # of the depth buffer; some five points a pixel
 BEHIND_CM = 0.4  # so far behind the nearest point of its pixel a point is still of the same surface, seen at a slant
+AT_ONCE = 1000  # points, whose neighbours are listed
 OUTLIER_MARGIN = 0.25  # outliers fill the cloud's box, grown by this share of its size
 
 
@@ -118,9 +119,13 @@ def add_noise(points: FloatArray, std_cm: float, random: np.random.Generator, re
     noise summed over those within `reach_cm` of each point, scaled to the same standard deviation."""
     if reach_cm == 0.0:
         return points + random.normal(0.0, std_cm, points.shape)
-    white = random.standard_normal(points.shape)
-    near = cKDTree(points).query_ball_point(points, reach_cm)
-    return points + std_cm * np.array([white[those].sum(axis=0) / np.sqrt(len(those)) for those in near])
+    white, tree = random.standard_normal(points.shape), cKDTree(points)
+    noisy = points.copy()
+    for first in range(0, len(points), AT_ONCE):
+        block = slice(first, first + AT_ONCE)
+        near = tree.query_ball_point(points[block], reach_cm)
+        noisy[block] += std_cm * np.array([white[those].sum(axis=0) / np.sqrt(len(those)) for those in near])
+    return noisy
 
 
 def visible(points: FloatArray, surface: FloatArray, toward: FloatArray) -> NDArray[np.bool_]:

@@ -4,9 +4,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from phytofit.errors import PhytofitError
+from phytofit.errors import CloudError, NoPhytomerError, SettingError
 from phytofit.fitting import fit
 from phytofit.simulation import simulate
 from phytofit.species import Species, load_species
@@ -49,11 +50,15 @@ def trial(
     species = load_species() if species is None else species
     pairs, refused = [], []
     for i in range(number):
-        made = simulate(species, seed=seed + i, **sensor)
         name = f"phytomer_{i + 1:04d}"
         try:
+            made = simulate(species, seed=seed + i, **sensor)
+        except SettingError as error:  # its spheres may remove all points of one phytomer, and leave the next
+            refused.append(f"{name}: {error}")
+            continue
+        try:
             result = fit(made.points, "cm", species=species, threads=threads)
-        except PhytofitError as error:
+        except (CloudError, NoPhytomerError) as error:
             refused.append(f"{name}: {error}")
         else:
             for truth, found in zip(measure(made.organs), result.traits, strict=True):
@@ -118,23 +123,14 @@ def trial_table(setting: str, trials: Mapping[int, Trial], percent: float, degre
     rows = []
     for value, made in sorted(trials.items()):
         share = share_within(made, percent, degrees)
-        for a in agreement(made.comparison.pairs):
-            if a.trait in MAIN_TRAITS:
-                refused = made.n - a.n
-                rows.append(
-                    (
-                        setting,
-                        value,
-                        a.trait,
-                        a.unit,
-                        a.n,
-                        a.bias,
-                        a.rmse,
-                        share[a.trait],
-                        a.coverage,
-                        a.flagged,
-                        refused,
-                    )
-                )
+        found = {a.trait: a for a in agreement(made.comparison.pairs)}
+        for trait in MAIN_TRAITS:
+            unit = "deg" if "angle" in trait else "cm"
+            if trait not in found:
+                rows.append((setting, value, trait, unit, 0, np.nan, np.nan, 0.0, np.nan, 0, made.n))
+                continue
+            a = found[trait]
+            errors = (a.bias, a.rmse, share[trait], a.coverage)
+            rows.append((setting, value, trait, unit, a.n, *errors, a.flagged, made.n - a.n))
     columns = ["setting", "value", "trait", "unit", "n", "bias", "rmse", "within", "coverage", "flagged", "refused"]
     return pd.DataFrame(rows, columns=columns)

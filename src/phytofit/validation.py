@@ -1,10 +1,10 @@
 """Results against hand measures: pairs of the same trait of the same cloud, and how well they agree."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -72,11 +72,12 @@ class Agreement(NamedTuple):
 
 
 def read_measures(path: str | Path) -> pd.DataFrame:
-    """Hand measures as a table (cloud, trait, value, unit), from a CSV file.
+    """Hand measures as a table (cloud, rank, trait, value, unit), from a CSV file.
 
     Either one row a cloud, with a column a trait whose name says the unit (``leaf_length_cm``, ``Leaf length (mm)``,
     ``angle [deg]``; angles may do without); or one row a cloud and trait, with columns cloud, trait, value and unit, as
-    ``phytofit simulate`` writes its truth.  Empty cells are no measures.  InputError where that can't be read.
+    ``phytofit simulate`` writes its truth.  Of whole plants a column ``rank`` says which leaf, from the base.  Empty
+    cells are no measures.  InputError where that can't be read.
     """
     path = Path(path)
     table = _read_csv(path)
@@ -88,25 +89,28 @@ def read_measures(path: str | Path) -> pd.DataFrame:
             f"got {', '.join(table.columns)}"
         )
     lower = {column.strip().lower(): column for column in table.columns}
+    ranks = table[lower["rank"]] if "rank" in lower else [""] * len(table)
     if {"trait", "value"} <= set(lower):
         unit = lower.get("unit")
         rows = [
-            (name, trait, number, "" if unit is None else u)
-            for name, trait, number, u in zip(
-                table[cloud], table[lower["trait"]], table[lower["value"]], table[unit or cloud], strict=True
+            (name, rank, trait, number, "" if unit is None else u)
+            for name, rank, trait, number, u in zip(
+                table[cloud], ranks, table[lower["trait"]], table[lower["value"]], table[unit or cloud], strict=True
             )
         ]
     else:
-        found = {column: _trait_of(column, path) for column in table.columns if column != cloud}
+        found = {
+            column: _trait_of(column, path) for column in table.columns if column not in (cloud, lower.get("rank"))
+        }
         traits = {column: it for column, it in found.items() if it is not None}
         if not traits:
             raise InputError(
                 f"{path}: expected columns such as leaf_length_cm or 'Leaf angle (deg)', got {', '.join(table.columns)}"
             )
         rows = [
-            (name, trait, number, unit)
+            (name, rank, trait, number, unit)
             for column, (trait, unit) in traits.items()
-            for name, number in zip(table[cloud], table[column], strict=True)
+            for name, rank, number in zip(table[cloud], ranks, table[column], strict=True)
         ]
     return _in_units(rows, path)
 
@@ -129,23 +133,34 @@ def compare(measures: pd.DataFrame, results: pd.DataFrame) -> Comparison:
     """Pairs of hand measures (as `read_measures` gives them) and results (a table with the columns of ``traits.csv``).
 
     A cloud is found by its name, else by its name without case and file ending, else by its number without leading
-    zeros, where only one is like that.
+    zeros, where only one is like that.  Where measures have a ``rank``, of the leaf, it has to be the result's.
+
+    Raises InputError where a result has a trait of several leaves and the measures do not say of which.
     """
     named = _by_name(measures["cloud"].unique(), results["cloud"].unique())
     pairs, lone = [], []
-    given = {(row["cloud"], row["trait"]): row for row in results.to_dict("records")}
+    given: dict[tuple[str, str], list[dict[Hashable, Any]]] = {}
+    for result in results.to_dict("records"):
+        given.setdefault((result["cloud"], result["trait"]), []).append(result)
     for row in measures.to_dict("records"):
-        cloud = named.get(row["cloud"])
-        result = given.get((cloud, row["trait"]))
-        if result is None:
-            lone.append(f"measured, no result: {row['cloud']}" + ("" if cloud is None else f", {row['trait']}"))
+        cloud, rank = named.get(row["cloud"]), row.get("rank", "")
+        found = [r for r in given.get((str(cloud), row["trait"]), []) if not rank or str(r.get("rank", "")) == rank]
+        if len(found) > 1:
+            raise InputError(
+                f"{row['cloud']}: the results have {row['trait']} of {len(found)} leaves; expected a column rank in "
+                "the measures, that counts leaves from the base"
+            )
+        leaf = f" leaf {rank}" if rank else ""
+        if not found:
+            lone.append(f"measured, no result: {row['cloud']}{leaf}" + ("" if cloud is None else f", {row['trait']}"))
             continue
+        result = found[0]
         if result["unit"] != row["unit"]:
             raise InputError(
                 f"{row['cloud']}, {row['trait']}: measured in {row['unit']}, but the result is in {result['unit']}"
             )
         shown = [result[key] for key in ("value", "low", "high", "flags")]
-        pairs.append((cloud, row["trait"], row["unit"], row["value"], *shown))
+        pairs.append((f"{cloud}{leaf}", row["trait"], row["unit"], row["value"], *shown))
     lone += [f"result, not measured: {cloud}" for cloud in results["cloud"].unique() if cloud not in named.values()]
     table = pd.DataFrame(pairs, columns=PAIR_COLUMNS)
     return Comparison(table.astype(dict.fromkeys(PAIR_COLUMNS[3:7], float)), tuple(dict.fromkeys(lone)))
@@ -242,9 +257,9 @@ def _trait_of(column: str, path: Path) -> tuple[str, str] | None:
     return None
 
 
-def _in_units(rows: list[tuple[str, str, str, str]], path: Path) -> pd.DataFrame:
+def _in_units(rows: list[tuple[str, str, str, str, str]], path: Path) -> pd.DataFrame:
     made = []
-    for cloud, trait, text, unit in rows:
+    for cloud, rank, trait, text, unit in rows:
         if not str(text).strip():
             continue
         try:
@@ -255,8 +270,8 @@ def _in_units(rows: list[tuple[str, str, str, str]], path: Path) -> pd.DataFrame
         if written not in UNITS:
             raise InputError(f"{path}: {cloud}, {trait}: expected a unit ({', '.join(UNITS)}), got {unit!r}")
         factor, named = UNITS[written]
-        made.append((cloud.strip(), trait.strip(), factor * value, named))
-    return pd.DataFrame(made, columns=["cloud", "trait", "value", "unit"])
+        made.append((cloud.strip(), str(rank).strip(), trait.strip(), factor * value, named))
+    return pd.DataFrame(made, columns=["cloud", "rank", "trait", "value", "unit"])
 
 
 def _by_name(wanted: NDArray[np.object_], there: NDArray[np.object_]) -> Mapping[str, str]:

@@ -121,6 +121,9 @@ def reconstruct_command(
 
         phytofit reconstruct scan --camera realsense-d4xx --poses poses.json
     """
+    if images.is_dir() and images.resolve() == folder.resolve():
+        complain(f"{folder}: the folder of the images can't hold the results; name another with --out")
+        raise typer.Exit(2)
     try:
         prepare_folder(folder)
         with Progress(
@@ -286,14 +289,14 @@ def run_command(
                 told=told,
             )
         )
-    _print_plant(made, source.stem)
+    _print_plant(made)
     out.print(f"Look at {folder / 'plant.png'}; all traits: {folder / 'traits.csv'}", highlight=False)
 
 
-def _print_plant(made: PlantRun, name: str) -> None:
+def _print_plant(made: PlantRun) -> None:
     whole = made.table[made.table["organ"] == "plant"].set_index("trait")[["value", "unit"]].to_dict("index")
     said = [f"{str(trait).replace('_', ' ')} {row['value']:.3g} {row['unit']}" for trait, row in whole.items()]
-    out.print(f"{name}: {', '.join(said).replace(' 1,', ',')}", highlight=False)
+    out.print(f"{made.segmentation.cloud.name}: {', '.join(said).replace(' 1,', ',')}", highlight=False)
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for column in ("leaf", *SHOWN.values()):
         table.add_column(column, justify="right", no_wrap=True)
@@ -302,7 +305,9 @@ def _print_plant(made: PlantRun, name: str) -> None:
         of_leaf = mine.drop_duplicates("trait").set_index("trait")
         table.add_row(str(rank), *(_with_interval(of_leaf, trait) for trait in SHOWN))
     out.print(table)
-    for text in made.remarked:
+    for text in made.notes:
+        out.print(f"note: {text}", highlight=False)
+    for text in made.flags:
         out.print(f"[bold yellow]flag:[/] {text}", highlight=False)
     if made.skipped:
         out.print(f"up to date, not done again: {', '.join(made.skipped)}", highlight=False)

@@ -104,9 +104,10 @@ def validate_command(
         "outlier_share": outliers,
     }
     chosen = or_exit(lambda: load_species(species))
-    or_exit(lambda: simulate(chosen, seed=seed, **sensor))  # tells what is wrong with a setting
+    checked = {**sensor, "n_spheres": min(spheres, 0)}  # how many points spheres leave differs from leaf to leaf
+    or_exit(lambda: simulate(chosen, seed=seed, **checked))
     or_exit(lambda: prepare_folder(folder))
-    trials = _tried(sensor, chosen, number, seed, threads)
+    trials = or_exit(lambda: _tried(sensor, chosen, number, seed, threads))
     base = trials["the sensor"][0]
     if base.comparison.pairs.empty:
         complain(f"none of the {number} simulated clouds could be fitted: {base.comparison.unmatched[0]}")

@@ -2,5 +2,6 @@
 
 from phytofit.reconstruct.cameras import CAMERAS, Camera, load_camera
 from phytofit.reconstruct.depth import Reconstruction, reconstruct
+from phytofit.reconstruct.views import depth_files
 
-__all__ = ["CAMERAS", "Camera", "Reconstruction", "load_camera", "reconstruct"]
+__all__ = ["CAMERAS", "Camera", "Reconstruction", "depth_files", "load_camera", "reconstruct"]

@@ -36,7 +36,12 @@ def depth_files(folder: Path, pattern: str = "*") -> list[Path]:
     if not folder.is_dir():
         found = "is a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: {found}, expected a folder of depth images")
-    files = [path for path in folder.glob(pattern) if path.suffix.lower() in SUFFIXES and path.is_file()]
+    try:
+        files = [path for path in folder.glob(pattern) if path.suffix.lower() in SUFFIXES and path.is_file()]
+    except (NotImplementedError, ValueError) as error:  # an absolute pattern, or none
+        raise InputError(
+            f"--pattern {pattern}: expected one such as 'depth_*.png', within the folder ({error})"
+        ) from None
     if not files:
         raise InputError(f"{folder}: no depth images found (pattern {pattern!r}), expected {', '.join(SUFFIXES)} files")
     return sorted(files, key=_natural)

@@ -69,10 +69,15 @@ def table_text(table: pd.DataFrame) -> str:
 
 
 @contextmanager
-def whole_folder(folder: Path, name: str) -> Iterator[Path]:
-    """A hidden folder to write into; when all is written it becomes ``folder/name``, in the place of an older one."""
+def whole_folder(folder: Path, name: str, mark: str) -> Iterator[Path]:
+    """A hidden folder to write into; when all is written it becomes ``folder/name``, in the place of an older one.
+
+    Raises OutputError where there is a folder of that name without the file `mark`, which is no result of ours.
+    """
     folder = prepare_folder(folder)
     target = folder / name
+    if target.exists() and not (target / mark).is_file() and not (target.is_dir() and not any(target.iterdir())):
+        raise OutputError(f"{target}: it is there already, and holds no {mark} of an earlier run; name another --out")
     part = Path(tempfile.mkdtemp(prefix=f".{name}.part-", dir=folder))
     try:
         part.chmod(0o755)

@@ -37,7 +37,7 @@ def save_fit(result: Fit, cloud: PointCloud, folder: str | Path, name: str | Non
     A folder of that name from an earlier run is replaced.  model.ply is in the input's unit and frame.
     """
     name = name or cloud.name
-    with whole_folder(Path(folder), name) as part:
+    with whole_folder(Path(folder), name, "fit.json") as part:
         (part / "fit.json").write_text(json.dumps(_as_json(result, cloud, name), indent=1) + "\n", encoding="utf-8")
         (part / "traits.csv").write_text(table_text(trait_table(name, result.traits)), encoding="utf-8", newline="")
         model = mesh(result.organs)

@@ -111,7 +111,7 @@ def save_segmentation(result: Segmentation, folder: str | Path, name: str | None
     A folder of that name from an earlier run is replaced.  The clouds are in the input's unit and frame, with labels.
     """
     name = name or result.cloud.name
-    with whole_folder(Path(folder), name) as part:
+    with whole_folder(Path(folder), name, "segmentation.json") as part:
         write_cloud(part / "plant.ply", result.plant)
         (part / "phytomers").mkdir()
         for leaf, phytomer in zip(result.leaves, result.phytomers(), strict=True):

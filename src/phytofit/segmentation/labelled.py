@@ -9,10 +9,10 @@ from phytofit.errors import CloudError
 from phytofit.segmentation.graph import PlantGraph, geodesics, plant_graph
 from phytofit.segmentation.organs import SLICE, Organs, along_path, centerline
 
-__all__ = ["labelled_organs"]
+__all__ = ["labelled_organs", "leaf_names"]
 
 FloatArray = NDArray[np.float64]
-LEAST_POINTS = 10  # of the stem
+LEAST_POINTS = 10  # of the stem, and of a leaf
 FORWARD = 0.3  # of a leaf's length from its collar: where its direction against the stem's is measured
 
 
@@ -23,14 +23,14 @@ def labelled_organs(
 
     Raises CloudError where no stem or no leaf is labelled.
     """
-    if cloud.labels is None or not (cloud.labels == 1).sum() >= LEAST_POINTS or not (cloud.labels > 1).any():
+    if cloud.labels is None or not (cloud.labels == 1).sum() >= LEAST_POINTS or not len(leaf_names(cloud)):
         found = "none" if cloud.labels is None else f"the labels {np.unique(cloud.labels).tolist()[:12]}"
         raise CloudError(
-            f"{cloud.name}: expected a point property with labels, 1 stem (at least {LEAST_POINTS} points) and "
-            f"2.. leaves, found {found}"
+            f"{cloud.name}: expected a point property with labels, 1 stem and 2.. leaves (at least {LEAST_POINTS} "
+            f"points each), found {found}"
         )
-    names = np.unique(cloud.labels[cloud.labels > 1])
-    used = np.flatnonzero(cloud.labels > 0)
+    names = leaf_names(cloud)
+    used = np.flatnonzero((cloud.labels == 1) | np.isin(cloud.labels, names))
     kept = np.intersect1d(first, used)
     missing = [name for name in [1, *names] if not (cloud.labels[kept] == name).any()]
     kept = np.union1d(kept, [int(np.flatnonzero(cloud.labels == name)[0]) for name in missing]).astype(np.intp)
@@ -58,6 +58,13 @@ def labelled_organs(
         tips.append(int(nodes[np.argmax(distance[nodes])]))
         levels.append(float(distance[nodes].min()))
     return graph, distance, Organs(labels, path, radius, tuple(tips), tuple(levels)), up
+
+
+def leaf_names(cloud: PointCloud) -> NDArray[np.int64]:
+    """The labels (m,) of leaves; fewer than `LEAST_POINTS` points of a label are a slip of the hand, and no leaf."""
+    assert cloud.labels is not None
+    names, count = np.unique(cloud.labels[cloud.labels > 1], return_counts=True)
+    return names[count >= LEAST_POINTS]
 
 
 def _base(graph: PlantGraph, given: NDArray[np.int64], stem: NDArray[np.intp], up: FloatArray | None) -> int:

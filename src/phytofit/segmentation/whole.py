@@ -13,7 +13,7 @@ from phytofit.segmentation.derive import SegmentedLeaf, derive_leaves
 from phytofit.segmentation.graph import PlantGraph, coarse, geodesics, plant_graph
 from phytofit.segmentation.ground import find_ground
 from phytofit.segmentation.growing import grow
-from phytofit.segmentation.labelled import labelled_organs
+from phytofit.segmentation.labelled import labelled_organs, leaf_names
 from phytofit.segmentation.organs import Organs, along_path, find_organs
 from phytofit.segmentation.root import find_root
 
@@ -145,7 +145,10 @@ def segment(
     ranked[numbers] = np.arange(2, len(numbers) + 2)
     if labelled:
         assert cloud.labels is not None
-        given = np.unique(cloud.labels[cloud.labels > 1])
+        given = leaf_names(cloud)
+        strays = np.count_nonzero((cloud.labels > 1) & ~np.isin(cloud.labels, given))
+        if strays:
+            notes.append(f"{strays} points whose label few others have were left out")
         table = dict(zip(given.tolist(), ranked[2:].tolist(), strict=True)) | {1: 1}
         labels = np.array([table.get(v, 0) for v in np.unique(cloud.labels).tolist()], np.int64)[
             np.unique(cloud.labels, return_inverse=True)[1]
