@@ -26,9 +26,9 @@ class Budget(NamedTuple):
     generations: int = 10
     cells: tuple[tuple[int, int], ...] = tuple((n, m) for m in (1000, 5000, 10000) for n in (100, 500, 1000))
     candidates: int = 20  # of a cell of Table I, that peers are measured on
-    ablated: int = 12  # phytomers
+    ablated: int = 10  # phytomers
     ablation_samples: int = 200
-    baseline: int = 20  # phytomers, each way, of the comparison with the baseline
+    baseline: int = 10  # phytomers, each way, of the comparison with the baseline
 
     @property
     def search(self) -> dict[str, int]:
