@@ -49,6 +49,8 @@ def test_another_state_of_the_code_keeps_apart(tmp_path, monkeypatch):
     (tmp_path / "a.py").write_text("x = 1\n")
     monkeypatch.setattr(jobs, "SOURCES", (tmp_path,))
     before = jobs.state_of_the_code()
+    (tmp_path / ".kept").mkdir()
+    (tmp_path / ".kept" / "func_code.py").write_text("x = 3\n")  # as joblib does
     assert jobs.state_of_the_code() == before
     (tmp_path / "a.py").write_text("x = 2\n")
     assert jobs.state_of_the_code() != before
