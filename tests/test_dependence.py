@@ -82,6 +82,7 @@ def test_errors_of_neighbours_are_found_to_be_correlated(seed, k):
     assert found.inflation > 2.0
 
 
+@pytest.mark.long
 def test_the_inflation_is_that_of_many_clouds():
     """Of clouds of one phytomer: so many times more do sums of scores vary than those of independent points."""
     sums, estimates, independent = [], [], 0.0

@@ -85,6 +85,7 @@ def test_what_is_up_to_date_is_not_done_again_and_what_changed_is(made):
     assert set(run(folder / "plant.ply", out, units="cm", up="z").skipped) == {"segment"} | fitted - {one}
 
 
+@pytest.mark.long
 def test_what_is_damaged_is_made_again_and_what_was_edited_is_not_lost(made, tmp_path):
     folder = tmp_path / "copy"
     shutil.copytree(made[0], folder)

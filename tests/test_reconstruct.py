@@ -430,6 +430,7 @@ class TestCommandLine:
 
 
 @pytest.mark.skipif(not REAL.exists(), reason=f"no real scan in {REAL}")
+@pytest.mark.long
 def test_a_real_scan_is_fused_within_its_noise():
     found = phytofit.reconstruct(REAL, "kinect-v2", pattern="DepthImage_*.png", step_deg=30.0)
     assert abs(found.step_deg) == pytest.approx(360.0 / 11.0, abs=0.3)

@@ -28,7 +28,6 @@ __all__ = ["READERS", "read_cloud", "write_cloud"]
 
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # or it prints what is raised here anyway
 
-LABELLED_CM = 1.0  # the least size of a cloud with labels
 XYZ, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 ALIASES = {"normal_x": "nx", "normal_y": "ny", "normal_z": "nz", "r": "red", "g": "green", "b": "blue"}
 PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -73,8 +72,7 @@ def read_cloud(
         Take so many points, drawn uniformly from the area of the faces (PLY), instead of the vertices; the
         draw is always the same.  Label, colour and normal are those of the nearest corner.
     plausible_cm
-        The least and the greatest size that is believed, cm; of a cloud with labels, which was looked at before, the
-        least is 1 cm at most.
+        The least and the greatest size that is believed, cm.
 
     Raises
     ------
@@ -117,10 +115,7 @@ def read_cloud(
         colors=stacked.get(COLOR),
         name=path.stem,
         source=path,
-        plausible_cm=(
-            plausible_cm[0] if label_key not in columns else min(plausible_cm[0], LABELLED_CM),
-            plausible_cm[1],
-        ),
+        plausible_cm=plausible_cm,
     )
 
 

@@ -27,7 +27,14 @@ STEPS: dict[str, Callable[..., Any]] = {
     "distance_chamfer": chamfer,
     "distance_labels": labelled_hausdorff,
 }
-NOT_SETTINGS = {"progress", "executor", "threads", "units", "starts"}  # inputs, and what does not change the result
+NOT_SETTINGS = {
+    "told",
+    "progress",
+    "executor",
+    "threads",
+    "units",
+    "starts",
+}  # inputs, and what does not change the result
 FROM_FIT = {"n_points", "seed", "distance"}  # fit hands these on
 
 
