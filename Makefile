@@ -1,6 +1,7 @@
 # Everything starts here. `make demo` and `make test` do all the set-up on a fresh machine with Python >= 3.11.
 PYTHON ?= python3
 BIN := .venv/bin
+EACH_CORE := --numprocesses auto --dist loadfile
 export OMP_NUM_THREADS ?= 1
 
 .PHONY: install demo test test-long check bench bench-accuracy bench-segment paper docs
@@ -18,10 +19,10 @@ demo: install
 	$(BIN)/phytofit demo --out demo
 
 test: install
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(EACH_CORE)
 
 test-long: install
-	$(BIN)/python -m pytest -m 'long or not long'
+	$(BIN)/python -m pytest $(EACH_CORE) -m 'long or not long'
 
 check: install
 	$(BIN)/ruff check
