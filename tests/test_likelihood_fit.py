@@ -55,6 +55,16 @@ def flagged(result, text):
     return any(text in flag for flag in result.flags)
 
 
+def test_a_leaf_that_holes_cut_in_two_is_followed_beyond_them():
+    """Without points in four spheres of 6 cm: a first guess ends at one of them, and leaves a fifth of the points out."""
+    made = phytofit.simulate(n_points=5000, noise_cm=0.5, seed=900013)
+    centers = made.points[[4422, 4200, 3995, 4157]]  # at 0.71, 0.65, 0.5, 0.21 of the midrib
+    gone = (np.linalg.norm(made.points[:, np.newaxis] - centers, axis=2) < 3.0).any(axis=1)
+    result = without(made, gone)
+    assert abs(result.parameters["leaf_length"] - made.x[3]) < 1.0
+    assert result.estimate.share[2] < 0.03
+
+
 def test_recovers_a_simulated_phytomer_within_its_own_errors(made, result):
     assert len(result.x) == 7  # the paper's model, and the stem above the leaf: the data ask for nothing more
     std = np.sqrt(np.diag(result.covariance))

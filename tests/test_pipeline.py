@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
-from phytofit import from_points, read_cloud, write_cloud
+from phytofit import NoPhytomerError, fit, from_points, read_cloud, write_cloud
 from phytofit.cli import app
 from phytofit.errors import InputError, OutputError
 from phytofit.pipeline import plant_traits, run
@@ -50,7 +50,7 @@ def made(tmp_path_factory):
     known = known_plant()
     write_cloud(folder / "plant.ply", from_points(known.points, "cm"))
     stages = []
-    result = run(folder / "plant.ply", folder / "out", units="cm", up="z", told=lambda *said: stages.append(said))
+    result = run(folder / "plant.ply", folder / "out", units="cm", up="z", progress=lambda *said: stages.append(said))
     return folder, known, result, stages
 
 
@@ -114,6 +114,32 @@ def test_with_another_setting_the_stages_that_follow_from_it_are_done_again(made
     shutil.copytree(made[0], tmp_path / "copy")
     again = run(tmp_path / "copy" / "plant.ply", tmp_path / "copy" / "out", units="cm", up="z", seed=1)
     assert again.skipped == ("segment",)
+
+
+def test_a_leaf_that_can_t_be_fitted_keeps_its_length_and_is_not_tried_again(made, tmp_path, monkeypatch):
+    shutil.copytree(made[0], tmp_path / "copy")
+    out = tmp_path / "copy" / "out"
+    tried = []
+
+    def refuse(phytomer, **how):
+        tried.append(phytomer.name)
+        if how["seed"] == 2 and phytomer.name.endswith("leaf_01"):
+            return fit(phytomer, **how)
+        raise NoPhytomerError("no stem with a leaf was found")
+
+    monkeypatch.setattr("phytofit.pipeline.fit", refuse)
+    first, again, other = (
+        run(tmp_path / "copy" / "plant.ply", out, units="cm", up="z", seed=seed, threads=1) for seed in (1, 1, 2)
+    )
+    leaves = len(first.segmentation.leaves)
+    assert len(tried) == 2 * leaves
+    assert again.skipped == ("segment", *(f"leaf_{rank:02d}" for rank in range(1, leaves + 1)))
+    pd.testing.assert_frame_equal(first.table, again.table)
+    assert sum("not fitted: no stem with a leaf" in flag for flag in again.flags) == leaves
+    lengths = again.table[again.table["trait"] == "leaf_length"]["value"].tolist()
+    assert lengths == pytest.approx([leaf.length for leaf in first.segmentation.leaves])
+    assert (out / "leaves" / "leaf_01" / "fit.json").exists()  # with another seed it could be fitted
+    assert sum("not fitted" in flag for flag in other.flags) == leaves - 1
 
 
 def test_corrected_labels_are_taken_over(made, tmp_path):

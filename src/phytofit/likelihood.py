@@ -14,11 +14,11 @@ from phytofit.kernels.likelihood import CHANGES, log_density, segment_changes
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
 
-__all__ = ["N_STRIPS", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
+__all__ = ["NOISE", "N_STRIPS", "OUTLIERS", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 
 FloatArray = NDArray[np.float64]
 N_EXTRA = 12  # entries of theta after the model's parameters, see State
-THICKNESS = -3  # its place in theta
+NOISE, THICKNESS, OUTLIERS = slice(-5, -3), -3, -1  # their places in theta
 NO_THICKNESS_CM = 1e-6
 LEAST_NOISE_CM = 0.05  # a midrib of straight pieces lies up to 0.02 cm off a curved one
 LEAST_SEEN, SEEN_SPREAD = 0.3, 0.3  # of the midrib: bound, and the prior's spread below 1

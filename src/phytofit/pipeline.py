@@ -40,7 +40,7 @@ PLANT_CM = (3.0, 500.0)  # sizes that are believed of a whole plant, from the se
 KEY = "stage.json"
 OF_SEGMENTATION = "from the segmentation"
 OF_THE_CUT = ("stem_length",)  # of a phytomer: where it was cut decides them
-Told = Callable[[str, int, int], None]
+Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def run(
     species: Species | str = "sorghum",
     seed: int = 0,
     threads: int | None = None,
-    told: Told = lambda stage, done, total: None,
+    progress: Progress = lambda stage, done, total: None,
 ) -> PlantRun:
     """Measure all leaves of a plant.
 
@@ -83,7 +83,7 @@ def run(
         :func:`phytofit.reconstruct`; or a plant's cloud in `units`, with `up` where it is known
     labels : name of a property of the cloud that tells stem (1) and leaves (2..) instead of finding them
     species, seed, threads : as for :func:`phytofit.fit`
-    told : called with a stage, and how much of how much of it is done
+    progress : called with a stage, and how much of how much of it is done
 
     Raises InputError and NoStemError where nothing can be measured.  A leaf whose fit is refused keeps what its
     segmentation tells.
@@ -93,7 +93,7 @@ def run(
         raise InputError(f"{folder}: the folder of the images can't hold the results; name another with --out")
     folder, name = prepare_folder(folder), source.resolve().stem if source.is_file() else source.resolve().name
     species = species if isinstance(species, Species) else load_species(species)
-    log = _Log([], [], [], told)
+    log = _Log([], [], [], progress)
     cloud_file = source
     if source.is_dir():
         if camera is None:
@@ -105,9 +105,9 @@ def run(
     found = _segmented(cloud_file, folder, {"name": name, "units": units, "up": up, "labels": labels}, log)
     tables = [trait_table(name, plant_traits(found))]
     for i, (leaf, phytomer) in enumerate(zip(found.leaves, found.phytomers(), strict=True)):
-        told("fit", i, len(found.leaves))
+        progress("fit", i, len(found.leaves))
         tables.append(_fitted(found, leaf, phytomer, folder, species, {"seed": seed, "threads": threads}, log))
-    told("fit", len(found.leaves), len(found.leaves))
+    progress("fit", len(found.leaves), len(found.leaves))
     for old in sorted((folder / "leaves").glob("leaf_*"))[len(found.leaves) :]:
         shutil.rmtree(old)  # of an earlier run that saw more leaves
     whole = pd.concat(tables, ignore_index=True)
@@ -125,12 +125,12 @@ class _Log:
     flags: list[str]
     notes: list[str]
     skipped: list[str]
-    told: Told
+    progress: Progress
 
 
 def _reconstructed(source: Path, folder: Path, how: Mapping[str, Any], log: _Log) -> Path:
     """The file of the cloud that the images give."""
-    log.told("reconstruct", 0, 1)
+    log.progress("reconstruct", 0, 1)
     images = depth_files(source, how["pattern"])
     given = [Path(file) for file in (how["camera"], how["poses"]) if file is not None and Path(file).is_file()]
     settings = {name: None if value is None else str(value) for name, value in how.items()}
@@ -148,7 +148,7 @@ def _reconstructed(source: Path, folder: Path, how: Mapping[str, Any], log: _Log
 
 
 def _segmented(cloud_file: Path, folder: Path, how: Mapping[str, Any], log: _Log) -> Segmentation:
-    log.told("segment", 0, 1)
+    log.progress("segment", 0, 1)
     target = folder / "segmentation"
     labels = how["labels"]
     with warnings.catch_warnings():
@@ -189,12 +189,14 @@ def _fitted(
     if _up_to_date(target, key):
         log.skipped.append(name)
     else:
+        if (target / KEY).is_file() and not (target / "fit.json").exists():
+            shutil.rmtree(target)  # of an earlier run, that could not fit it
         try:
-            result = fit(phytomer, species=species, up=found.up, **how)
+            save_fit(fit(phytomer, species=species, up=found.up, **how), phytomer, folder / "leaves", name)
         except (NoPhytomerError, CloudError) as error:
-            log.flags.append(f"leaf {leaf.rank}: not fitted: {error}")
-            return trait_table(found.cloud.name, [_by_its_points(found, leaf, str(error))])
-        save_fit(result, phytomer, folder / "leaves", name)
+            shutil.rmtree(target, ignore_errors=True)  # of an earlier run, that could fit it
+            by_points = trait_table(found.cloud.name, [_by_its_points(found, leaf, str(error))])
+            write_text(prepare_folder(target) / "traits.csv", table_text(by_points))
         _done(target, key, ("traits.csv",))
     table = pd.read_csv(target / "traits.csv")
     flags = "; ".join(table["flags"].dropna()).split("; ")
@@ -242,7 +244,7 @@ def _apart(a: float, b: float) -> float:
 def _by_its_points(found: Segmentation, leaf: SegmentedLeaf, reason: str) -> Trait:
     """The length of a leaf that could not be fitted, along its points."""
     unit = "rel" if found.cloud.unit == "none" else "cm"
-    flags = (*leaf.flags, f"not fitted: {reason}")
+    flags = (f"not fitted: {reason}",)
     return Trait("leaf", leaf.rank, "leaf_length", leaf.length, unit, None, None, OF_SEGMENTATION, flags)
 
 

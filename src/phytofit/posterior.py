@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from phytofit.beginnings import along_points, lower_insertion, turned_blade
 from phytofit.dependence import Dependence, score_dependence, width_misfit
 from phytofit.distances import Reference, chamfer
 from phytofit.flags import Sighting, density_over, sighting
-from phytofit.likelihood import THICKNESS, CloudLikelihood, Evaluation, State
+from phytofit.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, Evaluation, State
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
 from phytofit.species import Species
@@ -27,6 +28,8 @@ FloatArray = NDArray[np.float64]
 COARSE_POINTS = 700  # that decide which start is the best
 FEW_POINTS = 1250  # with which a refinement begins, and which decide from where a richer leaf is begun
 SCOUT_ITERATIONS, COARSE_ITERATIONS = 5, 25  # of all starts; then of those that may be the best
+LEFT_OUT, HELD_OUTLIERS = 0.1, 0.1  # share of outliers, from which it is tried with few of them; so many for a leaf's
+HELD_ITERATIONS = 12
 HOPELESS = 0.3  # nats for each point, by which a start is behind after the first
 COARSE_TOLERANCE = 1.0  # nats; it is refined with all points afterwards
 START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some cm off is drawn in
@@ -197,22 +200,30 @@ class _Chosen(NamedTuple):
 
 
 def _drawn_in(plain: Species, cloud: _Cloud, begun: Sequence[tuple[FloatArray, FloatArray]]) -> State:
-    """The best of what the beginnings (parameters and pose) lead to, with a part of the points and wide noise."""
-    coarse = cloud._replace(executor=None).part(COARSE_POINTS).likelihood(plain)  # one thread a start
+    """The best of what the beginnings (parameters and pose) lead to, with a part of the points and wide noise.
+
+    Where that leaves many points out, as beyond a hole, they are gone through again with wide noise and few outliers.
+    """
+    coarse, held = (cloud._replace(executor=None).part(COARSE_POINTS).likelihood(plain) for _ in range(2))  # one thread
     noise_cm = START_NOISE * float(plain.space.mean[plain.space.index("leaf_length")])
     states = [coarse.start(mean, pose, noise_cm) for mean, pose in begun]
     run = map if cloud.executor is None else cloud.executor.map
 
-    def refined(states: Sequence[State], max_iterations: int) -> list[tuple[float, State]]:
-        call = partial(_refined, coarse, max_iterations=max_iterations, tolerance=COARSE_TOLERANCE)
+    held.lower[NOISE], held.upper[OUTLIERS] = np.log(0.5 * noise_cm), np.log(HELD_OUTLIERS)
+
+    def refined(
+        states: Sequence[State], max_iterations: int, likelihood: CloudLikelihood = coarse
+    ) -> list[tuple[float, State]]:
+        call = partial(_refined, likelihood, max_iterations=max_iterations, tolerance=COARSE_TOLERANCE)
         ends = zip(run(call, states), states, strict=True)
         return [(end.error, State(end.theta, state.pose, state.center)) for end, state in ends]
 
     scouted = refined(states, SCOUT_ITERATIONS)
     enough = min(error for error, _ in scouted) + HOPELESS * len(cloud.points)
-    return min(
-        refined([state for error, state in scouted if error <= enough], COARSE_ITERATIONS), key=lambda end: end[0]
-    )[1]
+    found = refined([state for error, state in scouted if error <= enough], COARSE_ITERATIONS)
+    if min(found, key=itemgetter(0))[1].share[2] > LEFT_OUT:
+        found += refined([state for _, state in refined(states, HELD_ITERATIONS, held)], COARSE_ITERATIONS)
+    return min(found, key=itemgetter(0))[1]
 
 
 def _candidates(plain: Species, species: Species, cloud: _Cloud, state: State) -> list[_End]:

@@ -28,7 +28,6 @@ STEPS: dict[str, Callable[..., Any]] = {
     "distance_labels": labelled_hausdorff,
 }
 NOT_SETTINGS = {
-    "told",
     "progress",
     "executor",
     "threads",

@@ -132,11 +132,18 @@ def reconstruct_command(
         ) as bar:  # fmt: skip
             task = bar.add_task("images", total=STAGES)
 
-            def told(stage: str) -> None:
+            def progress(stage: str) -> None:
                 bar.update(task, description=stage, advance=1)
 
             result = reconstruct(
-                images, camera, step_deg=step, unit=unit, poses=poses, pattern=pattern, spacing_cm=spacing, told=told
+                images,
+                camera,
+                step_deg=step,
+                unit=unit,
+                poses=poses,
+                pattern=pattern,
+                spacing_cm=spacing,
+                progress=progress,
             )
             save_reconstruction(result, folder)
     except PhytofitError as error:
@@ -268,7 +275,7 @@ def run_command(
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("images", total=1)
 
-        def told(stage: str, done: int, total: int) -> None:
+        def progress(stage: str, done: int, total: int) -> None:
             bar.update(task, description=STAGE_NAMES[stage], completed=done, total=total)
 
         made = or_exit(
@@ -286,7 +293,7 @@ def run_command(
                 species=species,
                 seed=seed,
                 threads=threads,
-                told=told,
+                progress=progress,
             )
         )
     _print_plant(made)

@@ -1,5 +1,7 @@
 """Pictures of whole plants: reconstructed, taken apart, measured."""
 
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -17,7 +19,6 @@ __all__ = ["plot_plant", "plot_reconstruction", "plot_segmentation"]
 FloatArray = NDArray[np.float64]
 
 SIDES = (("from the side", 0, 2), ("from the front", 1, 2), ("from above", 0, 1))
-MOST_COLORS = 8  # views; more share the last colour
 LEAF_COLORS = ("#E69F00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442")  # Okabe and Ito, by rank
 STEM_COLOR, UNKNOWN_COLOR = "#000000", "#BBBBBB"
 MOST_DRAWN = 30_000  # points of a plant
@@ -25,26 +26,28 @@ TABLE_TRAITS = ("leaf_length", "leaf_width", "leaf_angle", "leaf_azimuth", "coll
 
 
 def plot_reconstruction(result: Reconstruction, title: str = "") -> Figure:
-    """The cloud from three sides, cm, z up, each point coloured by how many views saw it; flags in the title."""
+    """The cloud from three sides, cm, z up, each point coloured by the view that it came from; flags in the title."""
     points = result.cloud.points
     span = np.ptp(points, axis=0) + 4.0
     widths = [float(span[a]) for _, a, _ in SIDES]
     figure = Figure(figsize=(14.0, 7.0), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 3, width_ratios=[max(w, 0.4 * max(widths)) for w in widths])
-    most = min(MOST_COLORS, len(result.files))
-    norm = BoundaryNorm(np.arange(0.5, max(most, 2) + 1.0), 256)
-    shown = np.minimum(result.n_views, most)
+    n = len(result.files)
+    norm = BoundaryNorm(np.arange(-0.5, max(n, 2)), 256)
+    mixed = np.random.default_rng(0).permutation(len(points))  # so that no view covers the others
     for ax, (name, a, b) in zip(axes, SIDES, strict=True):
-        ax.scatter(points[:, a], points[:, b], c=shown, cmap="viridis", norm=norm, s=1.0, linewidths=0, rasterized=True)
+        across, up, view = points[mixed, a], points[mixed, b], result.view[mixed]
+        ax.scatter(across, up, c=view, cmap="viridis", norm=norm, s=1.0, linewidths=0, rasterized=True)
         ax.set_aspect("equal")
         ax.set_xlabel(f"{'xyz'[a]} (cm)")
         ax.set_ylabel(f"{'xyz'[b]} (cm)")
         ax.set_title(name, fontsize=10)
         ax.grid(alpha=0.25)
-    bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=list(axes), shrink=0.5, ticks=range(1, max(most, 2) + 1))
-    more = f" ({most}: or more)" if len(result.files) > most else ""
-    bar.set_label(f"views that saw a point{more}")
+    ticks = list(range(0, n, max(1, n // 12)))
+    bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=list(axes), shrink=0.7, ticks=ticks)
+    bar.ax.set_yticklabels([Path(result.files[i]).stem for i in ticks], fontsize=7)
+    bar.set_label("view that a point came from")
     numbers = [f"{len(result.files)} views, {len(points)} points"]
     if result.step_deg is not None:
         numbers.append(f"step {abs(result.step_deg):.1f}°")

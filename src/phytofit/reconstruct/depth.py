@@ -38,7 +38,8 @@ class Reconstruction:
     """A plant's cloud from several depth images, and how far to trust it.
 
     ``cloud`` in cm, z up, with normals; on a turntable z is its axis, x points to the first view's camera, and z = 0
-    is the pot's rim, or the lowest point if no pot was found.  ``n_views`` (n,) counts the views that saw each point.
+    is the pot's rim, or the lowest point if no pot was found.  ``view`` (n,) is the number of
+    the view (in ``files``) that each point came from, ``n_views`` (n,) how many saw it.
     ``files`` and ``poses`` (k, 4, 4), camera to world, are those of the views used.  ``turn`` and ``step_deg`` are None
     where poses were given; ``loop`` is what is left of a turn after all pairwise registrations, degrees and cm, None
     where it does not close.  ``contradicted`` is the share of all points that was dropped, since other views see
@@ -46,6 +47,7 @@ class Reconstruction:
     """
 
     cloud: PointCloud
+    view: NDArray[np.int64]
     n_views: NDArray[np.int64]
     camera: Camera
     files: tuple[str, ...]
@@ -74,7 +76,7 @@ def reconstruct(
     poses: str | Path | None = None,
     pattern: str = "*",
     spacing_cm: float | None = None,
-    told: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Reconstruction:
     """Reconstruct a plant's cloud from the depth images in a folder.
 
@@ -92,7 +94,7 @@ def reconstruct(
         A file of known viewpoints (:func:`read_poses`); then nothing has to turn.
     spacing_cm
         Between points of the cloud; by default that of neighbouring pixels on the plant.
-    told
+    progress
         Is called with a word on each stage as it begins.
 
     Raises
@@ -108,7 +110,7 @@ def reconstruct(
         raise SettingError(f"--spacing {spacing_cm:g}: expected 0.01 to 5 cm")
     chosen = load_camera(camera) if isinstance(camera, str) else camera
     folder = Path(folder)
-    told("images")
+    progress("images")
     files = depth_files(folder, pattern)
     images = read_views(files, chosen, unit=unit)
     given = None if poses is None else read_poses(Path(poses), [image.file for image in images])
@@ -117,10 +119,10 @@ def reconstruct(
                 "pattern": pattern, "spacing_cm": spacing_cm}  # fmt: skip
     with threadpool_limits(limits=1, user_api="blas"):  # more would round sums in another order
         if given is not None:
-            placed = place_by_poses(views, given, chosen, told)
+            placed = place_by_poses(views, given, chosen, progress)
         else:
-            placed = place_on_turntable(views, chosen, step_deg, told)
-        told("fusion")
+            placed = place_on_turntable(views, chosen, step_deg, progress)
+        progress("fusion")
         return _fused(views, placed, chosen, spacing_cm, folder, settings)
 
 
@@ -215,6 +217,7 @@ def _fused(
         kept = kept - [0.0, 0.0, kept[:, 2].min()]
     return Reconstruction(
         cloud=PointCloud(kept, normals=fused.normals, name=folder.resolve().name),
+        view=fused.view,
         n_views=fused.n_views,
         camera=camera,
         files=tuple(views.files),

@@ -20,13 +20,15 @@ N_NEIGHBORS = 32  # that are averaged, at most
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """Points (n, 3), cm, unit normals (n, 3) towards the cameras, and by how many views (n,) each was seen.
+    """Points (n, 3), cm, unit normals (n, 3) towards the cameras, the number (n,) of the view that each came from, and
+    by how many views (n,) it was seen.
 
     ``contradicted`` is the share of all views' points that was dropped, since other views see through them.
     """
 
     points: FloatArray
     normals: FloatArray
+    view: NDArray[np.int64]
     n_views: NDArray[np.int64]
     contradicted: float
 
@@ -78,7 +80,7 @@ def fuse(
     row = np.broadcast_to(np.arange(len(points))[:, None], index.shape)
     seen_by[row[near], view[index[near]]] = True
     first = _one_per_voxel(moved, spacing_cm)
-    return Fused(moved[first], normal[first], seen_by.sum(axis=1)[first], contradicted)
+    return Fused(moved[first], normal[first], view[first], seen_by.sum(axis=1)[first], contradicted)
 
 
 def _one_per_voxel(points: FloatArray, edge: float) -> NDArray[np.intp]:

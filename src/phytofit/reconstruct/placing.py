@@ -65,11 +65,11 @@ class Placed:
     lowest_is_ground: bool = False  # no pot was found: the plant's lowest point becomes z = 0
 
 
-def place_on_turntable(views: Views, camera: Camera, step_deg: float | None, told: Callable[[str], None]) -> Placed:
+def place_on_turntable(views: Views, camera: Camera, step_deg: float | None, progress: Callable[[str], None]) -> Placed:
     if len(views.files) < 3:
         left_out = "".join(f"; {r.file}: {r.reason}" for r in views.rejected)
         raise InputError(f"found {len(views.files)} usable views, expected at least 3 of a turntable{left_out}")
-    told("what turns")
+    progress("what turns")
     rays = camera.rays()
     scene = scene_without_plant(np.stack(views.depths))
     masks = _bodies([moving_pixels(depth, scene) for depth in views.depths], views.depths, rays)
@@ -81,8 +81,8 @@ def place_on_turntable(views: Views, camera: Camera, step_deg: float | None, tol
         )
     _judge_frame(views, masks)
     clouds = [view_points(d, rays, m) for d, m in zip(views.depths, masks, strict=True)]
-    turn = find_turn(clouds, step_deg=step_deg, told=told)
-    told("registration")
+    turn = find_turn(clouds, step_deg=step_deg, progress=progress)
+    progress("registration")
     turn, poses, pairs, good = _relaxed_turn(clouds, turn)
     if not all(good):
         masks = [m for m, yes in zip(masks, good, strict=True) if yes]
@@ -187,14 +187,16 @@ def _relaxed_turn(clouds: Sequence[FloatArray], turn: Turn) -> tuple[Turn, Float
     return turn, poses, pairs, _fitting(_overlaps(pairs, len(clouds)))
 
 
-def place_by_poses(views: Views, given: dict[str, FloatArray], camera: Camera, told: Callable[[str], None]) -> Placed:
+def place_by_poses(
+    views: Views, given: dict[str, FloatArray], camera: Camera, progress: Callable[[str], None]
+) -> Placed:
     """Views at known poses (camera to world, cm, z up), relaxed a little so that they fit each other.
 
     The plant is what is near the place that the cameras look at, without what stands round about it below.
     """
     if not views.files:
         raise InputError("no usable view: " + "; ".join(f"{r.file}: {r.reason}" for r in views.rejected))
-    told("what is the plant")
+    progress("what is the plant")
     rays = camera.rays()
     poses = np.stack([given[file] for file in views.files])
     focus, reach = _focus(poses, views.depths, rays)
@@ -216,7 +218,7 @@ def place_by_poses(views: Views, given: dict[str, FloatArray], camera: Camera, t
         raise InputError("no plant in view: nothing stands where the cameras look; are poses, unit and camera right?")
     poses = np.stack([given[file] for file in views.files])
     _judge_frame(views, masks)
-    told("registration")
+    progress("registration")
     clouds = [view_points(d, rays, m) for d, m in zip(views.depths, masks, strict=True)]
     surfaces = _surfaces(clouds)
     pairs: tuple[Pair, ...] = ()

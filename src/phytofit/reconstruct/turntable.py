@@ -96,7 +96,7 @@ def find_turn(
     step_deg: float | None = None,
     tolerance: float = 0.35,
     n_samples: int = 250,
-    told: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Turn:
     """The axis and the angles of views of something that turns by about the same step between each two.
 
@@ -130,7 +130,7 @@ def find_turn(
         up, point = _axis(x)
         return float(np.mean([fields.smooth(_turned(samples[:-gap], up, point, gap * x[5]), gap) for gap in gaps]))
 
-    told("axis and step")
+    progress("axis and step")
     tries = STEPS_DEG if step_deg is None else step_deg * np.linspace(1 - tolerance, 1 + tolerance, 15)
     steps = np.radians(np.concatenate([tries, -tries]))
     offsets = reach * np.linspace(-0.1, 0.3, 5)  # of the axis behind what is seen, which faces the camera
@@ -148,7 +148,7 @@ def find_turn(
     hills.sort(key=lambda hill: hill[0])
     best = min((_descend(cost, x, 250) for _, x in hills[:2]), key=lambda hill: hill[0])[1]
     up, point = _axis(best)
-    told("angles")
+    progress("angles")
     return Turn(up, point, _angles(samples, fields, up, point, float(best[5])))
 
 

@@ -22,7 +22,7 @@ __all__ = ["leaf_table", "read_segmentation", "save_reconstruction", "save_segme
 
 
 def save_reconstruction(result: Reconstruction, folder: str | Path) -> Path:
-    """Write into the folder plant.ply (cm, z up, normals, ``n_views`` a point), reconstruction.json and
+    """Write into the folder plant.ply (cm, z up, normals, ``view`` and ``n_views`` a point), reconstruction.json and
     reconstruction.png; those of an earlier run are replaced once all three are made.
 
     Raises
@@ -35,7 +35,11 @@ def save_reconstruction(result: Reconstruction, folder: str | Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=".reconstruction.part-", dir=folder))
-        write_cloud(part / "plant.ply", result.cloud, {"n_views": result.n_views.astype(np.int32)})
+        write_cloud(
+            part / "plant.ply",
+            result.cloud,
+            {"view": result.view.astype(np.int32), "n_views": result.n_views.astype(np.int32)},
+        )
         text = json.dumps(_as_json(result), indent=1) + "\n"
         (part / "reconstruction.json").write_text(text, encoding="utf-8", newline="")
         figure = plot_reconstruction(result, title=result.cloud.name)
