@@ -56,7 +56,7 @@ def flagged(result, text):
 
 
 def test_a_leaf_that_holes_cut_in_two_is_followed_beyond_them():
-    """Without points in four spheres of 6 cm: a first guess ends at one of them, and leaves a fifth of the points out."""
+    """Without points in four spheres: a first guess ends at one of them, and leaves a fifth of the points out."""
     made = phytofit.simulate(n_points=5000, noise_cm=0.5, seed=900013)
     centers = made.points[[4422, 4200, 3995, 4157]]  # at 0.71, 0.65, 0.5, 0.21 of the midrib
     gone = (np.linalg.norm(made.points[:, np.newaxis] - centers, axis=2) < 3.0).any(axis=1)
