@@ -132,7 +132,7 @@ def lengths(table: pd.DataFrame, out: Path) -> None:
         ax.set(xlabel="copy", title=what)
         ax.grid(alpha=0.25)
     axes[0].set_ylabel("leaf length (cm)")
-    axes[0].legend(fontsize=9, loc="lower left")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
     figure.suptitle("Dashed: the same method on the untouched cloud; grey: ± 5 cm, as the paper found", fontsize=11)
     save(figure, out / "fig7d.png")
 
