@@ -6,6 +6,7 @@ from typer.testing import CliRunner
 
 import phytofit
 from phytofit.cli import app
+from phytofit.cli.validate import _tell
 from phytofit.trials import MAIN_TRAITS, Trial, needed, share_within, trial, trial_table, vary
 from phytofit.validation import PAIR_COLUMNS, Comparison
 
@@ -59,6 +60,17 @@ def test_enough_is_from_where_on_nine_of_ten_are_near():
     assert needed({3: good, 1: bad, 2: good}, 5.0, 3.0)["leaf_length"] == (2, 1.0)
     assert needed({1: good, 2: bad, 3: good}, 5.0, 3.0)["leaf_length"] == (3, 1.0)
     assert needed({1: bad, 2: bad}, 5.0, 3.0)["leaf_length"] == (None, 0.8)
+
+
+def test_where_few_phytomers_contradict_each_other_more_are_asked_for(tmp_path, capsys):
+    """Near enough with 300 points and not with 1,000: chance, and no answer."""
+    good, bad = made_up([0.0] * 10), made_up([0.0] * 8 + [9.0, 9.0])
+    sensor = {**SENSOR, "noise_reach_cm": 0.0, "n_views": 3, "n_spheres": 0, "outlier_share": 0.0}
+    base = Trial(good.comparison, good.n, sensor)
+    _tell(base, {"points": {300: good, 1000: bad}, "cameras": {1: bad, 2: bad}}, 5.0, 3.0, tmp_path)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "leaf length within 5 % of the truth in nine of ten: 10 phytomers can't tell; raise --number" in said
+    assert "not with up to 2 cameras (at best in 80 %)" in said
 
 
 def test_a_cloud_that_can_not_be_fitted_is_counted_and_named():

@@ -14,7 +14,7 @@ from phytofit.species import Species, load_species
 from phytofit.traits import measure
 from phytofit.validation import PAIR_COLUMNS, Comparison, agreement
 
-__all__ = ["Trial", "needed", "share_within", "trial", "trial_table", "vary"]
+__all__ = ["ENOUGH", "Trial", "needed", "share_within", "trial", "trial_table", "vary"]
 
 MAIN_TRAITS = ("leaf_length", "leaf_angle", "leaf_width", "stem_diameter")
 N_POINTS = (300, 1000, 2500, 5000)

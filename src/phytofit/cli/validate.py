@@ -33,7 +33,7 @@ from phytofit.report import agreement_page, agreement_table, trial_page
 from phytofit.results import prepare_folder, table_text, write_text
 from phytofit.simulation import simulate
 from phytofit.species import Species, load_species
-from phytofit.trials import N_POINTS, N_VIEWS, Trial, needed, trial, trial_table, vary
+from phytofit.trials import ENOUGH, N_POINTS, N_VIEWS, Trial, needed, trial, trial_table, vary
 from phytofit.validation import Agreement, agreement, compare, read_measures, read_results
 
 __all__ = ["validate_command"]
@@ -170,6 +170,8 @@ def _tell(base: Trial, trials: Mapping[str, Mapping[int, Trial]], percent: float
             said = f"{trait.replace('_', ' ')} within {near} of the truth in nine of ten: "
             if least is not None:
                 answers.append(f"{said}with {least:,} {name if least > 1 else name[:-1]} or more")
+            elif most >= ENOUGH:
+                answers.append(f"{said}{base.n} phytomers can't tell; raise --number")
             else:
                 answers.append(f"{said}not with up to {max(made):,} {name} (at best in {100 * most:.0f} %)")
     title = f"{base.n} simulated phytomers, {_described(base.sensor)}"
