@@ -28,8 +28,8 @@ FloatArray = NDArray[np.float64]
 COARSE_POINTS = 700  # that decide which start is the best
 FEW_POINTS = 1250  # with which a refinement begins, and which decide from where a richer leaf is begun
 SCOUT_ITERATIONS, COARSE_ITERATIONS = 5, 25  # of all starts; then of those that may be the best
-LEFT_OUT, HELD_OUTLIERS = 0.1, 0.1  # share of outliers, from which it is tried with few of them; so many for a leaf's
-HELD_ITERATIONS = 12
+LEFT_OUT = 0.1  # share of outliers, above which all starts are tried again with few of them
+HELD_OUTLIERS, HELD_ITERATIONS = 0.1, 12  # at most, then, for each point of the leaf
 HOPELESS = 0.3  # nats for each point, by which a start is behind after the first
 COARSE_TOLERANCE = 1.0  # nats; it is refined with all points afterwards
 START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some cm off is drawn in
@@ -204,7 +204,8 @@ def _drawn_in(plain: Species, cloud: _Cloud, begun: Sequence[tuple[FloatArray, F
 
     Where that leaves many points out, as beyond a hole, they are gone through again with wide noise and few outliers.
     """
-    coarse, held = (cloud._replace(executor=None).part(COARSE_POINTS).likelihood(plain) for _ in range(2))  # one thread
+    part = cloud._replace(executor=None).part(COARSE_POINTS)  # one thread a start
+    coarse, held = part.likelihood(plain), part.likelihood(plain)
     noise_cm = START_NOISE * float(plain.space.mean[plain.space.index("leaf_length")])
     states = [coarse.start(mean, pose, noise_cm) for mean, pose in begun]
     run = map if cloud.executor is None else cloud.executor.map
