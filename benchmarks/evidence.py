@@ -42,7 +42,8 @@ from scipy.special import log_ndtr
 import phytofit
 from phytofit.dependence import score_dependence
 from phytofit.fitting import mean_at
-from phytofit.flags import density_over
+from phytofit.hidden import Hidden
+from phytofit.holes import find_holes
 from phytofit.likelihood import NO_THICKNESS_CM, NOISE_CM, NOISE_FACTOR, THICKNESS, CloudLikelihood, State
 from phytofit.optimize import refine
 from phytofit.posterior import estimate
@@ -72,12 +73,12 @@ Gains = dict[str, tuple[float, float]]  # by model: over the neutral value, over
 
 
 class Fitted(NamedTuple):
-    """A leaf, and where each model of `HELD` comes to rest; all have the same `density` of points over the leaf (what
+    """A leaf, and where each model of `HELD` comes to rest; all have the same `hidden` parts of the leaf (what
     was not seen), and of the same `inflation` points whose errors depend on each other count as one."""
 
     leaf: Leaf
     states: dict[str, State]
-    density: np.ndarray | None
+    hidden: Hidden | None
     inflation: float
 
 
@@ -106,7 +107,7 @@ def likelihood_of(fitted: Fitted, held: dict[str, float], prior: Prior) -> Cloud
         organ=leaf.organ,
         weights=np.full(len(leaf.points), 1.0 / fitted.inflation),
         thick=True,
-        density=fitted.density,
+        hidden=fitted.hidden,
     )
     made.mean[LEARNED] = np.clip(prior.mean, made.lower[LEARNED], made.upper[LEARNED])
     made.precision[LEARNED] = prior.std**-2.0
@@ -183,7 +184,7 @@ def fit_leaf(leaf: Leaf) -> Fitted:
     likelihood = likelihood_of(fitted, {}, WIDE)
     state = best_end(likelihood, beginnings(leaf))
     for _ in range(HOLE_ROUNDS):
-        fitted = fitted._replace(density=density_over(likelihood, state, likelihood.evaluate(state).scores))
+        fitted = fitted._replace(hidden=find_holes(likelihood, state, likelihood.evaluate(state).scores))
         likelihood = likelihood_of(fitted, {}, WIDE)
         state = refined(likelihood, state)
     fitted = fitted._replace(inflation=score_dependence(likelihood, state).inflation)

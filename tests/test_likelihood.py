@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from phytofit import likelihood as module
+from phytofit.hidden import Hidden
 from phytofit.kernels.likelihood import log_density
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import LEAF, STEM, Organ, Phytomer, SurfaceSampler, move
@@ -73,9 +74,10 @@ def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0
     stem, leaf = organs
     n, m = len(points), len(leaf.frame)
     log_p = np.empty(n)
+    area = leaf.segment_lengths @ (leaf.half_width[1:] + leaf.half_width[:-1])
     log_density(
-        np.array(points, float), np.full(n, organ, np.int8),
-        leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, np.ones((m, 3)), np.zeros((m, 9, 0)),
+        np.array(points, float), np.full(n, organ, np.int8), np.ones(n),
+        leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, area, np.zeros((m, 9, 0)),
         np.zeros(0),
         stem.axis[:-1], stem.frame, stem.segment_lengths, 0.5 * (stem.half_width[1:] + stem.half_width[:-1]),
         np.zeros((len(stem.frame), 9, 0)), np.zeros(0),
@@ -387,27 +389,26 @@ def test_the_likelihood_of_a_state_is_the_density_of_its_organs(cut):
         np.testing.assert_allclose(np.exp(likelihood.evaluate(state).log_p[one]), expected, rtol=1e-8)
 
 
-def test_the_density_over_a_leaf_weighs_its_strips():
-    """A leaf is the mixture of its strips by area and density; and the scores are the slopes still."""
-    likelihood, state = scene(SHAPED, 8, n=60)
-    state = disturbed(likelihood, state, np.random.default_rng(8))
-    state.theta[-1] = -9.0
-    weight = np.random.default_rng(9).uniform(0.1, 1.0, (30, 3))
-    likelihood.organ = np.ones(60, np.int8)
-    likelihood.density = weight
-    leaf = grow(state.x)[1]
-    area = np.repeat(leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1]) / 3.0, 3)
-    parts = []
-    for one in np.eye(90):
-        likelihood.density = one.reshape(30, 3)
-        parts.append(np.exp(likelihood.evaluate(state, derivatives=False).log_p))
-    outliers = state.share[2] / ConvexHull(likelihood.points).volume
-    expected = (weight.ravel() * area) @ (np.array(parts) - outliers) / (weight.ravel() @ area) + outliers
-    likelihood.density = weight
-    np.testing.assert_allclose(np.exp(likelihood.evaluate(state).log_p), expected, rtol=1e-8)
-    likelihood.organ = np.full(60, -1, np.int8)
-    state.theta[-1] = -1.0
-    assert_scores_are_slopes(likelihood, state)
+def test_what_was_not_seen_takes_no_part_of_the_leaf():
+    """The rest of it is the denser, by the share of the area that is gone; and the scores are the slopes still."""
+    whole, state = scene(SHAPED, 8, n=60)
+    leaf = move(grow(state.x), whole.pose_of(state))[1]
+    share = np.linspace(0.1, 0.6, 30)[:, np.newaxis] + np.linspace(0.0, 0.3, 9)  # a spline gives straight lines back
+    share[0], share[-1] = share[1], share[-2]
+    organ = np.ones(60, np.int8)
+
+    def of_leaf(hidden):
+        likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, whole.points, organ=organ, thick=True, hidden=hidden)
+        return np.exp(likelihood.evaluate(state, derivatives=False).log_p) - likelihood.outlier_density * state.share[2]
+
+    area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
+    gone = area @ share.mean(axis=1) / area.sum()
+    hidden = Hidden(leaf, share)
+    expected = of_leaf(None) * (1.0 - hidden.at(whole.points)) / (1.0 - gone)
+    np.testing.assert_allclose(of_leaf(hidden), expected, rtol=2e-3, atol=1e-15)
+    hidden = Hidden(leaf, np.random.default_rng(9).uniform(0.0, 0.98, (30, 9)))
+    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, whole.points, thick=True, hidden=hidden)
+    assert_scores_are_slopes(likelihood, disturbed(likelihood, state, np.random.default_rng(8)))
 
 
 def test_a_part_of_a_piece_may_be_missing(clean):

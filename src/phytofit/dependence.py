@@ -153,7 +153,8 @@ def width_misfit(likelihood: CloudLikelihood, state: State, scores: FloatArray, 
     place, lateral = place[on_leaf], across[on_leaf, 0]
     half = np.interp(place * lengths.sum(), np.concatenate([[0.0], np.cumsum(lengths)]), leaf.half_width)
     ratio, chance = [], []
-    whole = np.all(likelihood.density == 1.0, axis=1)  # what is left around a hole says nothing of the width
+    hidden = likelihood.hidden
+    whole = np.ones(likelihood.model.n_pieces, bool) if hidden is None else np.all(hidden.share == 0.0, axis=1)
     for i in range(1, N_PIECES - 2):  # not where stem and tip are
         low, high = (int(np.floor(end * len(whole) / N_PIECES)) for end in (i, i + 1))
         those = (place * N_PIECES).astype(int) == i
@@ -288,7 +289,7 @@ def _line(x: FloatArray, y: FloatArray, count: FloatArray) -> tuple[float, float
 
     A fit takes a part of the errors up, which leaves a little less than the bell at all distances: the intercept.
     """
-    share = count / count.sum()
+    share = count / max(float(count.sum()), 1.0)  # none are near each other where hardly a point is the organ's
     x_mean, y_mean = float(share @ x), float(share @ y)
     square = max(float(count @ (x - x_mean) ** 2), 1e-12)
     slope = float(count @ ((x - x_mean) * y)) / square

@@ -7,21 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from phytofit.likelihood import N_STRIPS, CloudLikelihood, State
+from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import LEAF, Organ, move
 from phytofit.parameters import ParameterSpace
 
-__all__ = ["Sighting", "across_leaf", "density_over", "flags_of", "sighting"]
+__all__ = ["Sighting", "across_leaf", "clearly_lacking", "flags_of", "sighting", "strip_of"]
 
 FloatArray = NDArray[np.float64]
 N_SECTIONS = 20  # of the leaf, of equal area
 SEEN_DENSITY = 0.25  # of the leaf's typical density, from which a section counts as seen
-TYPICAL = 0.75  # quantile of the densities of the leaf's pieces that counts as that where all was seen
-HOLE, LEAST_DENSITY = 0.7, 0.02  # of it: below the one it is a hole, below the other nothing is gained
-SMOOTHING = (0.25, 0.5, 0.25)  # of the numbers of points on pieces of the leaf
-OFF_STEM = 3.0  # noise levels from the stem, within which a leaf has no holes
-CLEARLY, FEW_ON_PIECE = 4.0, 3.0  # standard deviations of the number of points; points
+TYPICAL = 0.75  # quantile of the numbers of points on parts of the leaf that counts as that where all was seen
+CLEARLY = 4.0  # standard deviations of the number of points
 NEAR_TIP, FEW_BEYOND, N_BEYOND = 0.15, 12, 4000  # of the leaf's length; points; points drawn around the tip
+N_STRIPS = 3  # of the blade, in which gaps are counted
 N_SECTORS = 12  # around the stem
 ROUND = 0.7  # share of them that must be seen
 BASE_SECTIONS = 2  # the leaf's first tenth
@@ -86,19 +84,19 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
 def _gaps(leaf: Organ, points: FloatArray, place: FloatArray) -> float:
     """Share of the blade that has few points where other parts have many; `place` (n,) of the area before each."""
     section = np.minimum((place * N_SECTIONS).astype(int), N_SECTIONS - 1)
-    found = np.bincount(section * N_STRIPS + _strip(leaf, points), minlength=N_SECTIONS * N_STRIPS)
+    found = np.bincount(section * N_STRIPS + strip_of(leaf, points, N_STRIPS), minlength=N_SECTIONS * N_STRIPS)
     found = found.reshape(N_SECTIONS, N_STRIPS)[BASE_SECTIONS:-END_SECTIONS]
     typical = float(np.quantile(found, TYPICAL))
-    return float(_clearly_lacking(found.astype(float), np.full(found.shape, typical)).mean())
+    return float(clearly_lacking(found.astype(float), np.full(found.shape, typical)).mean())
 
 
-def _clearly_lacking(found: FloatArray, wanted: FloatArray) -> NDArray[np.bool_]:
+def clearly_lacking(found: FloatArray, wanted: FloatArray, smoothed: float = 1.0) -> NDArray[np.bool_]:
     """Where next to none are found of the points that are wanted, or so few that neither chance nor the unevenness of
-    the rest explains it."""
+    the rest explains it; numbers that were `smoothed` vary by chance so much less."""
     share = found / np.maximum(wanted, 1e-9)
-    spread = np.maximum(np.sqrt(wanted), _upper_spread(share) * wanted)
+    spread = np.maximum(np.sqrt(smoothed * wanted), _upper_spread(share) * wanted)
     few = (share < GAP) & (wanted - found > CLEARLY * spread)
-    none = (share < EMPTY) & (wanted > CLEARLY**2)
+    none = (share < EMPTY) & (wanted > smoothed * CLEARLY**2)
     lacking: NDArray[np.bool_] = few | none
     return lacking
 
@@ -109,13 +107,13 @@ def _upper_spread(values: FloatArray) -> float:
     return float((high - typical) / 0.9704)  # of the normal quantiles' difference
 
 
-def _strip(leaf: Organ, points: FloatArray) -> NDArray[np.intp]:
+def strip_of(leaf: Organ, points: FloatArray, n_strips: int) -> NDArray[np.intp]:
     """Strip (n,) of the blade that is nearest to each point, from its right edge."""
     j, along = leaf.nearest(points)
     lateral = np.einsum("ni,ni->n", points - leaf.axis[j], leaf.frame[j][:, :, 1])
     slope = (leaf.half_width[j + 1] - leaf.half_width[j]) / leaf.segment_lengths[j]
     half = np.maximum(leaf.half_width[j] + slope * along, 1e-9)
-    strip: NDArray[np.intp] = np.clip((lateral / half + 1.0) * N_STRIPS / 2.0, 0, N_STRIPS - 1).astype(np.intp)
+    strip: NDArray[np.intp] = np.clip((lateral / half + 1.0) * n_strips / 2.0, 0, n_strips - 1).astype(np.intp)
     return strip
 
 
@@ -134,50 +132,6 @@ def _beyond_tip(likelihood: CloudLikelihood, state: State, scores: FloatArray) -
     inside = np.mean(np.all(around @ planes[:, :3].T + planes[:, 3] < 0.0, axis=1))
     expected = float(outlier.sum()) * inside * 4.0 / 3.0 * np.pi * near**3 * likelihood.outlier_density
     return len(there) if len(there) > expected + CLEARLY * np.sqrt(expected) else 0
-
-
-def density_over(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> FloatArray:
-    """Density (m, 3) of points on the pieces of the leaf and their strips, relative to where all was seen: 1 but in
-    clear holes.
-
-    A hole has leaf on both sides: what is missing at the tip is another matter, and near the stem it can't be told
-    whose the points are.  It may leave a part of the leaf's breadth; a strip that lacks points all along is no hole,
-    but a width that is not right yet.
-    """
-    on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2]
-    pose = likelihood.pose_of(state)
-    points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]
-    stem, leaf = (organ.row(0) for organ in likelihood.model.organs(state.x))
-    area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
-    piece, _ = leaf.nearest(points)
-    m = len(area)
-    found = np.bincount(piece, np.where(on_leaf > 0.5, on_leaf, 0.0), m).astype(float)
-    expected = np.convolve(area * found.sum() / area.sum(), SMOOTHING, "same")
-    found = np.convolve(found, SMOOTHING, "same")
-    ratio = found / np.maximum(expected, 1e-9)
-    typical = float(np.quantile(ratio, TYPICAL))
-    if typical == 0.0:  # hardly a point is the leaf's
-        return np.ones((m, N_STRIPS))
-    expected *= typical
-    ratio /= typical
-    seen = np.flatnonzero((ratio >= 0.5) & (found >= FEW_ON_PIECE))
-    middle = 0.5 * (leaf.axis[1:] + leaf.axis[:-1])
-    apart = np.hypot(middle[:, 0], middle[:, 1]) > stem.half_width.max() + OFF_STEM * max(state.noise[:2])
-    before = np.arange(m) < (seen[-1] if len(seen) else 0)
-    hole = apart & before & (ratio < HOLE) & (expected - found > CLEARLY * np.sqrt(expected))
-    density = np.repeat(np.where(hole, np.maximum(ratio, LEAST_DENSITY), 1.0)[:, np.newaxis], N_STRIPS, axis=1)
-    taken = on_leaf > 0.5
-    cells = np.bincount(piece[taken] * N_STRIPS + _strip(leaf, points[taken]), minlength=m * N_STRIPS)
-    cells = np.apply_along_axis(np.convolve, 0, cells.reshape(m, N_STRIPS).astype(float), SMOOTHING, "same")
-    wanted = expected[:, np.newaxis] / N_STRIPS
-    part = cells / np.maximum(wanted, 1e-9)
-    wide = 0.5 * (leaf.half_width[1:] + leaf.half_width[:-1]) > EDGE_ON * state.noise[1]
-    looked_at = apart & before & wide
-    lacking = np.zeros(cells.shape, bool)
-    if looked_at.any():
-        lacking[looked_at] = _clearly_lacking(cells[looked_at], np.repeat(wanted[looked_at], N_STRIPS, axis=1))
-    lacking &= lacking.mean(axis=0) < 0.5
-    return np.where(lacking, np.minimum(density, np.maximum(part, LEAST_DENSITY)), density)
 
 
 def across_leaf(likelihood: CloudLikelihood, state: State) -> tuple[FloatArray, FloatArray]:

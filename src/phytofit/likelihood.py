@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
+from phytofit.hidden import Hidden, cells
 from phytofit.kernels.likelihood import CHANGES, log_density, segment_changes
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
 
-__all__ = ["NOISE", "N_STRIPS", "OUTLIERS", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
+__all__ = ["NOISE", "OUTLIERS", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 
 FloatArray = NDArray[np.float64]
 N_EXTRA = 12  # entries of theta after the model's parameters, see State
@@ -24,10 +25,10 @@ LEAST_NOISE_CM = 0.05  # a midrib of straight pieces lies up to 0.02 cm off a cu
 LEAST_SEEN, SEEN_SPREAD = 0.3, 0.3  # of the midrib: bound, and the prior's spread below 1
 BLOCK = 500  # points that a thread takes at a time
 STEP = 1e-4  # of a prior's spread, for the derivatives of the organs
+POSE_STEP = 1e-4  # cm and radians, for those of the area that was seen
 NOISE_CM, NOISE_FACTOR = 0.3, 3.0  # of a surface's points: the prior's middle, and one spread of it
 SHARE_SPREAD = 2.5  # of the logits of the shares
 STEM_SHARE, OUTLIER_SHARE = 0.3, 0.03  # before a cloud is seen; the rest is the leaf's
-N_STRIPS = 3  # of a leaf, along it, that may be seen or not, see log_density
 MOST_OUTLIERS = np.log(4.0)  # bound of logit_outlier
 
 
@@ -109,8 +110,7 @@ class CloudLikelihood:
     weights : (n,) of the points; None: all 1
     thick : whether the leaf may have a thickness, which widens the noise across the blade
     cut : whether the leaf's tip may be missing
-    density : (n_pieces, 3) of points on the pieces of the leaf, three strips each, relative to where all was seen;
-        None: 1 everywhere
+    hidden : where points of the leaf were not seen; None: nowhere
     """
 
     def __init__(
@@ -123,7 +123,7 @@ class CloudLikelihood:
         weights: FloatArray | None = None,
         thick: bool = False,
         cut: bool = False,
-        density: FloatArray | None = None,
+        hidden: Hidden | None = None,
         executor: Executor | None = None,
     ) -> None:
         self.model = model
@@ -131,7 +131,8 @@ class CloudLikelihood:
         self.points = np.ascontiguousarray(points)
         self.organ = np.full(len(points), -1, np.int8) if organ is None else organ
         self.weights = weights
-        self.density = np.ones((model.n_pieces, N_STRIPS)) if density is None else density
+        self.hidden = hidden
+        self.seen = self._seen_at(self.points)
         self.outlier_density = 1.0 / _volume(self.points)
         self._executor = executor
         inside = 1.0 - STEM_SHARE - OUTLIER_SHARE
@@ -167,7 +168,18 @@ class CloudLikelihood:
         """The same likelihood, of points that have moved."""
         moved = copy.copy(self)
         moved.points = np.ascontiguousarray(points)
+        moved.seen = moved._seen_at(moved.points)
         return moved
+
+    def hiding(self, hidden: Hidden) -> "CloudLikelihood":
+        """The same likelihood, where other points were not seen."""
+        other = copy.copy(self)
+        other.hidden = hidden
+        other.seen = other._seen_at(other.points)
+        return other
+
+    def _seen_at(self, points: FloatArray) -> FloatArray:
+        return np.ones(len(points)) if self.hidden is None else 1.0 - self.hidden.at(points)
 
     def with_theta(self, state: State, theta: FloatArray) -> State:
         return State(theta, state.pose, state.center)
@@ -179,6 +191,33 @@ class CloudLikelihood:
         pose[:3, :3] = turn @ state.pose[:3, :3]
         pose[:3, 3] = turn @ (state.pose[:3, 3] - state.center) + state.center + state.shift
         return pose
+
+    def _area(
+        self, leaf: Organ, length: FloatArray, half: FloatArray, state: State, steps: FloatArray
+    ) -> tuple[float, FloatArray]:
+        """Area of the leaf, as far as it was seen, and the change (k + 7,) of its logarithm by parameters and pose.
+
+        The leaf is a population as :func:`segment_changes` takes it, in the model's frame; `steps` are empty where the
+        change is not wanted.
+        """
+        wanted = len(steps) > 0
+        change = np.zeros(len(steps) + 6 if wanted else 0)
+        middle = 0.5 * (half[:, 1:] + half[:, :-1])
+        whole = 2.0 * length * middle
+        area = whole.sum(axis=1)
+        if self.hidden is not None:
+            pose = self.pose_of(state)
+            places = cells(leaf.axis, leaf.frame, length, middle) @ pose[:3, :3].T + pose[:3, 3]
+            area = np.sum(whole * (1.0 - self.hidden.around_cells(places).mean(axis=2)), axis=1)
+            if wanted:
+                arm = places[0] - state.center - state.shift
+                turned = [np.cross(axis, arm) for axis in _left_jacobian(state.turn).T]
+                moves = POSE_STEP * np.array([*turned, *(np.broadcast_to(axis, arm.shape) for axis in np.eye(3))])
+                share = self.hidden.around_cells(np.concatenate([places[0] + moves, places[0] - moves])).mean(axis=2)
+                change[-6:] = (share[6:] - share[:6]) @ whole[0] / (2.0 * POSE_STEP * area[0])
+        if wanted:
+            change[: len(steps)] = _slope(np.log(area), steps)
+        return float(area[0]), change
 
     def evaluate(self, state: State, *, derivatives: bool = True) -> Evaluation:
         """The error and, if wanted, the scores (n, k + 12) of a state."""
@@ -196,29 +235,30 @@ class CloudLikelihood:
         pose = self.pose_of(state)
         r, t = pose[:3, :3], pose[:3, 3]
         n_columns = k + 7 if derivatives else 0
+        leaf_area, leaf_area_change = self._area(leaf, length, half, state, steps)
         leaf_change = np.empty((leaf.frame.shape[1], CHANGES, n_columns))
         stem_change = np.empty((stem.frame.shape[1], CHANGES, n_columns))
-        area_change, stem_area_change = np.zeros(n_columns), np.zeros(n_columns)
+        stem_area_change = np.zeros(n_columns)
         if derivatives:
             # axes of turning, shifts and centre as the model's frame sees them
             about = r.T @ _left_jacobian(state.turn), r.T, r.T @ (state.center + state.shift - t)
             segment_changes(leaf.axis, leaf.frame, length, half, steps, *about, leaf_change)
             segment_changes(stem.axis, stem.frame, stem_length, stem.half_width, steps, *about, stem_change)
-            area = np.sum(self.density.mean(axis=1) * length * (half[:, 1:] + half[:, :-1]), axis=1)
-            area_change[:n_steps] = _slope(np.log(area), steps)
             stem_area_change[:n_steps] = _slope(np.log(np.sum(stem_length * radius, axis=1)), steps)
         n = len(self.points)
         log_p = np.empty(n)
         scores = np.empty((n if derivatives else 0, k + N_EXTRA))
         arguments = (
-            leaf.axis[0, :-1] @ r.T + t, r @ leaf.frame[0], length[0], half[0], self.density, leaf_change, area_change,
-            stem.axis[0, :-1] @ r.T + t, r @ stem.frame[0], stem_length[0], radius[0], stem_change, stem_area_change,
+            leaf.axis[0, :-1] @ r.T + t, r @ leaf.frame[0], length[0], half[0], leaf_area, leaf_change,
+            leaf_area_change,
+            stem.axis[0, :-1] @ r.T + t, r @ stem.frame[0], stem_length[0], radius[0], stem_change,
+            stem_area_change,
             state.noise, state.share, self.outlier_density,
         )  # fmt: skip
 
         def block(first: int) -> None:
             part = slice(first, first + BLOCK)
-            log_density(self.points[part], self.organ[part], *arguments, log_p[part], scores[part])
+            log_density(self.points[part], self.organ[part], self.seen[part], *arguments, log_p[part], scores[part])
 
         firsts = range(0, n, BLOCK)
         done: Iterable[None] = map(block, firsts) if self._executor is None else self._executor.map(block, firsts)

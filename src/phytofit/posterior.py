@@ -16,7 +16,9 @@ from scipy.special import stdtrit
 from phytofit.beginnings import along_points, lower_insertion, turned_blade
 from phytofit.dependence import Dependence, score_dependence, width_misfit
 from phytofit.distances import Reference, chamfer
-from phytofit.flags import Sighting, density_over, sighting
+from phytofit.flags import Sighting, sighting
+from phytofit.hidden import Hidden
+from phytofit.holes import find_holes
 from phytofit.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, Evaluation, State
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
@@ -43,6 +45,7 @@ CLEARLY_BETTER = 5.0  # nats, by which another beginning of a richer leaf must f
 ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
+SAME_SHARE = 0.05
 LOWER_ROUNDS = 3
 LEAST_LEFT = 1.0 / 3.0  # of the residuals' degrees of freedom
 STEP = 0.02  # of a parameter's standard error, for differences of the gradient
@@ -231,7 +234,8 @@ def _candidates(plain: Species, species: Species, cloud: _Cloud, state: State) -
     """Refined: the paper's model, the same with its tip missing, and, if they promise enough, the two with all
     parameters of the species."""
     found = [_end(plain, state, cloud)]
-    found.append(_end(plain, _cut(found[0].state), cloud, cut=True))
+    hidden = found[0].likelihood.hidden
+    found.append(_end(plain, _cut(found[0].state), cloud, cut=True, hidden=hidden))
     if len(plain.space) == len(species.space):
         return found
     simple = found[1] if found[1].fit_of_points - found[0].fit_of_points > TIP_MISSING else found[0]
@@ -247,10 +251,15 @@ def _rich(species: Species, cloud: _Cloud, simple: _End) -> tuple[_End, _End]:
     begun = [simple.state, *turned_blade(species, simple.likelihood, simple.state, simple.at.scores)]
     best = max((_end(species, it, part, thick=True) for it in begun), key=lambda end: end.fit_of_points)
     best = _elsewhere(species, part, best, LOWER_ROUNDS)
-    best = _elsewhere(species, cloud, _end(species, best.state, cloud, thick=True), 1)
+    best = _end(species, best.state, cloud, thick=True, hidden=best.likelihood.hidden)
+    best = _elsewhere(species, cloud, best, 1)
+    hidden = best.likelihood.hidden
     begun = [_cut(best.state, share) for share in CUT_SHARES]
-    cut = max((_end(species, it, part, thick=True, cut=True) for it in begun), key=lambda end: end.fit_of_points)
-    return best, _end(species, cut.state, cloud, thick=True, cut=True)
+    cut = max(
+        (_end(species, it, part, thick=True, cut=True, hidden=hidden) for it in begun),
+        key=lambda end: end.fit_of_points,
+    )
+    return best, _end(species, cut.state, cloud, thick=True, cut=True, hidden=cut.likelihood.hidden)
 
 
 def _elsewhere(species: Species, cloud: _Cloud, best: _End, rounds: int) -> _End:
@@ -267,7 +276,7 @@ def _elsewhere(species: Species, cloud: _Cloud, best: _End, rounds: int) -> _End
 def _better(species: Species, cloud: _Cloud, best: _End, begun: Iterable[State]) -> _End:
     """Of the best so far and what other beginnings lead to, that which clearly fits better."""
     for state in begun:
-        end = _end(species, state, cloud, thick=True)
+        end = _end(species, state, cloud, thick=True, hidden=best.likelihood.hidden)
         if end.fit_of_points > best.fit_of_points + CLEARLY_BETTER:
             best = end
     return best
@@ -290,21 +299,35 @@ def _choice(found: Sequence[_End]) -> _Chosen:
     return _Chosen(found[best], evidence[best], dependence, best % 2 == 0 and gains[best] > TIP_DOUBTFUL, rival)
 
 
-def _end(species: Species, state: State, cloud: _Cloud, *, thick: bool = False, cut: bool = False) -> _End:
-    density = None
+def _end(
+    species: Species,
+    state: State,
+    cloud: _Cloud,
+    *,
+    thick: bool = False,
+    cut: bool = False,
+    hidden: Hidden | None = None,
+) -> _End:
+    """Where the state leads to; `hidden` is what is known before of what was not seen."""
     for number in range(HOLE_ROUNDS):
-        likelihood = cloud.likelihood(species, thick=thick, cut=cut, density=density)
+        likelihood = cloud.likelihood(species, thick=thick, cut=cut, hidden=hidden)
         state = likelihood.extended(state)
         if number == 0 and len(cloud.points) >= 2 * FEW_POINTS:
-            few = cloud.part(FEW_POINTS).likelihood(species, thick=thick, cut=cut)
+            few = cloud.part(FEW_POINTS).likelihood(species, thick=thick, cut=cut, hidden=hidden)
             state = likelihood.with_theta(state, _refined(few, state, tolerance=COARSE_TOLERANCE).theta)
         end = _refined(likelihood, state)
         state = State(end.theta, state.pose, state.center)
         at = likelihood.evaluate(state)
-        density = density_over(likelihood, state, at.scores)
-        if np.allclose(density, likelihood.density, atol=0.05):
+        hidden = find_holes(likelihood, state, at.scores)
+        if _alike(hidden, likelihood.hidden):
             break
     return _End(likelihood, state, at, end.converged)
+
+
+def _alike(one: Hidden | None, other: Hidden | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return bool(np.abs(one.share - other.share).max() <= SAME_SHARE)
 
 
 def _dithered(points: FloatArray, seed: int) -> FloatArray:
@@ -323,7 +346,7 @@ def _dithered(points: FloatArray, seed: int) -> FloatArray:
 
 def _promise(species: Species, end: _End, cloud: _Cloud) -> float:
     """Log probability that a richer leaf is expected to gain over the fitted one, by Rao's score test."""
-    likelihood = cloud.likelihood(species, cut=True)
+    likelihood = cloud.likelihood(species, cut=True, hidden=end.likelihood.hidden)
     state = likelihood.extended(end.state)
     state.theta[THICKNESS] = end.state.theta[THICKNESS]
     _, gradient, information = _terms(likelihood, state)
@@ -391,6 +414,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     )  # a fit takes some errors up
     variability = (dependence.variability + np.diag(likelihood.precision))[np.ix_(free, free)]
     covariance[np.ix_(free, free)] = inverse @ variability @ inverse * dependence.n_independent / left
+    covariance[np.ix_(free, free)] += _by_holes(end, inverse)
     seen = sighting(likelihood, state, at.scores)
     return Estimate(
         x=state.x.copy(),
@@ -414,6 +438,22 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         sighting=seen,
         dithered=dithered,
     )
+
+
+def _by_holes(end: _End, inverse: FloatArray) -> FloatArray:
+    """Covariance (m, m) of the free entries of theta, of which `inverse` is that of the curvature, as it is not known
+    where holes end: to a cell either way."""
+    likelihood, state, free = end.likelihood, end.state, end.free
+    if likelihood.hidden is None:
+        return np.zeros_like(inverse)
+    before = _gradient(likelihood, state, end.at)[free]
+    shifts = []
+    for other in (likelihood.hidden.smaller(), likelihood.hidden.larger()):
+        there = likelihood.hiding(other)
+        shifts.append(inverse @ (_gradient(there, state, there.evaluate(state))[free] - before))
+    both = np.array(shifts)
+    covariance: FloatArray = 0.5 * both.T @ both
+    return covariance
 
 
 def _curvature(end: _End) -> FloatArray:

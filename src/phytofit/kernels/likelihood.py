@@ -8,7 +8,6 @@ __all__ = ["CHANGES", "log_density", "segment_changes"]
 
 REACH = 5.5  # noise levels from a surface at which its density counts as none: e^-15 of the greatest
 CHANGES = 9  # of a segment: translation (3), rotation (3), length, half widths (a stem's radii) at both ends
-EDGES = np.array([-1.0, -1.0 / 3.0, 1.0 / 3.0, 1.0])  # of the strips of a leaf's segment, in half widths
 FARTHEST = 8.5  # standard deviations, beyond which a normal density is none: 1e-16
 ROOT_TWO_PI = np.sqrt(2.0 * np.pi)
 
@@ -81,19 +80,9 @@ def _normal(z):
 
 
 @kernel
-def _step(density, e):
-    """By how much the density rises at an edge of the strips, from right to left; beyond the outer ones it is 0."""
-    if e == 0:
-        return density[0]
-    if e == 3:
-        return -density[2]
-    return density[e] - density[e - 1]
-
-
-@kernel
 def log_density(
-    points, organ,
-    leaf_origin, leaf_frame, leaf_length, leaf_half, leaf_density, leaf_change, leaf_area_change,
+    points, organ, seen,
+    leaf_origin, leaf_frame, leaf_length, leaf_half, leaf_area, leaf_change, leaf_area_change,
     stem_origin, stem_frame, stem_length, stem_radius, stem_change, stem_area_change,
     noise, share, outlier_density,
     log_p, scores,
@@ -108,10 +97,10 @@ def log_density(
     ----------
     points : (n, 3)
     organ : (n,) int8: 0 stem, 1 leaf; -1 unknown, may be of either
+    seen : (n,) share of the leaf's points that is seen where each lies
     leaf_origin (m, 3), leaf_frame (m, 3, 3) columns tangent, lateral, normal, leaf_length (m,), leaf_half (m + 1,) :
         the leaf's segments, and half widths at the nodes
-    leaf_density (m, 3) : of points on three strips along each segment, from its right edge (negative lateral) to its
-        left, relative to where all was seen
+    leaf_area : of the leaf, as far as it was seen
     stem_origin (s, 3), stem_frame (s, 3, 3) columns tangent and two across, stem_length (s,), stem_radius (s,) : the
         stem's segments
     leaf_change (m, 9, k), leaf_area_change (k,), stem_change (s, 9, k), stem_area_change (k,) : change of a segment,
@@ -132,10 +121,6 @@ def log_density(
     far, reach, depth = REACH * stem_noise, REACH * leaf_noise, REACH * thickness
     stem_square, leaf_square = stem_noise * stem_noise, leaf_noise * leaf_noise
     thin = leaf_square / (thickness * thickness)
-    area = 0.0
-    for j in range(m):
-        mean = (leaf_density[j, 0] + leaf_density[j, 1] + leaf_density[j, 2]) / 3.0
-        area += mean * leaf_length[j] * (leaf_half[j] + leaf_half[j + 1])
     stem_area = 0.0
     for j in range(len(stem_length)):
         stem_area += stem_length[j] * stem_radius[j]
@@ -226,24 +211,21 @@ def log_density(
                 pull = at_start - at_end
                 s = min(max((u + leaf_square * pull) / length, 0.0), 1.0)
                 half = leaf_half[j] + s * slope
-                across, by_v, by_half, sideways = 0.0, 0.0, 0.0, 0.0
-                for e in range(4):
-                    step = _step(leaf_density[j], e)
-                    if step != 0.0:
-                        edge = half * EDGES[e] - v
-                        until_edge, at_edge = _normal(edge / leaf_noise)
-                        at_edge *= step / leaf_noise
-                        across -= step * until_edge
-                        by_v += at_edge
-                        by_half -= EDGES[e] * at_edge
-                        sideways += edge * at_edge
+                right, left = half + v, half - v  # from the edges
+                until_right, at_right = _normal(right / leaf_noise)
+                until_left, at_left = _normal(left / leaf_noise)
+                across = until_right + until_left
+                if across <= 0.0:
+                    continue
+                at_right /= leaf_noise * across
+                at_left /= leaf_noise * across
                 bell = np.exp(-0.5 * (w / thickness) ** 2) / (ROOT_TWO_PI * thickness)
-                density = share[1] / area * bell * along * across
+                density = share[1] * seen[i] / leaf_area * bell * along * across
                 if density <= 0.0:
                     continue
                 on_leaf += density
                 if wanted:
-                    by_v, by_half, sideways = by_v / across, by_half / across, sideways / across
+                    by_v, by_half = at_right - at_left, at_right + at_left
                     spread = u * at_start - (u - length) * at_end
                     by_place = by_half * slope / length  # of the place where the half width is taken
                     by_thickness = w * w / (thickness * thickness) - 1.0
@@ -252,7 +234,7 @@ def log_density(
                         - spread
                         + by_place
                         * (leaf_square * pull * (1.0 + spread) + u * u * at_start - (u - length) ** 2 * at_end)
-                        + sideways
+                        - (right * at_right + left * at_left)
                     )
                     by_u = density * (pull + by_place * (1.0 - spread - leaf_square * pull * pull))
                     by_v *= density

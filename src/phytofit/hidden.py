@@ -1,0 +1,88 @@
+"""What of a leaf a cloud lacks, as a part of space: points that came to lie there were not seen."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
+
+from phytofit.models import Organ
+
+__all__ = ["N_STRIPS", "Hidden", "cells"]
+
+FloatArray = NDArray[np.float64]
+N_STRIPS = 9  # of a leaf, along it
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """Share of the points that was not seen, around a leaf as it lay when that was found out.
+
+    The leaf's m pieces have nine strips each, from the right edge to the left.  ``share`` (m, 9) are the coefficients
+    of a cubic B-spline over these cells: without kinks, as a likelihood should be.  Beyond the middles of the outermost
+    it stays as it is there.
+    """
+
+    leaf: Organ
+    share: FloatArray
+
+    @cached_property
+    def _middle(self) -> FloatArray:
+        middle: FloatArray = 0.5 * (self.leaf.half_width[1:] + self.leaf.half_width[:-1])
+        return middle
+
+    @cached_property
+    def _centers(self) -> FloatArray:
+        """(m, 9, 3) of the cells."""
+        leaf = self.leaf
+        lengths, middle = leaf.segment_lengths[np.newaxis], self._middle[np.newaxis]
+        centers: FloatArray = cells(leaf.axis[np.newaxis], leaf.frame[np.newaxis], lengths, middle)[0]
+        return centers
+
+    @cached_property
+    def _long(self) -> FloatArray:
+        long: FloatArray = np.maximum(self.leaf.segment_lengths, 1e-9)
+        return long
+
+    @cached_property
+    def _wide(self) -> FloatArray:
+        wide: FloatArray = np.maximum(2.0 * self._middle / N_STRIPS, 1e-9)
+        return wide
+
+    def around_cells(self, places: FloatArray) -> FloatArray:
+        """Share (n, m, 9) not seen of points at places (n, m, 9, 3), each near the centre of its cell."""
+        offset = places - self._centers
+        tangent, lateral = self.leaf.frame[:, :, 0], self.leaf.frame[:, :, 1]
+        along = np.einsum("nmbi,mi->nmb", offset, tangent) / self._long[:, np.newaxis]
+        across = np.einsum("nmbi,mi->nmb", offset, lateral) / self._wide[:, np.newaxis]
+        return self._at(along + np.arange(len(self.share))[:, np.newaxis], across + np.arange(N_STRIPS))
+
+    def at(self, points: FloatArray) -> FloatArray:
+        """Share (n,) not seen of points like these (n, 3)."""
+        piece, along = self.leaf.nearest(points)
+        across = np.einsum("ni,ni->n", points - self.leaf.axis[piece], self.leaf.frame[piece][:, :, 1])
+        return self._at(piece + along / self._long[piece] - 0.5, across / self._wide[piece] + 0.5 * (N_STRIPS - 1))
+
+    def smaller(self) -> "Hidden":
+        """With holes that end a cell earlier."""
+        return Hidden(self.leaf, minimum_filter(self.share, 3, mode="nearest"))
+
+    def larger(self) -> "Hidden":
+        """With holes that end a cell later."""
+        return Hidden(self.leaf, maximum_filter(self.share, 3, mode="nearest"))
+
+    def _at(self, along: FloatArray, across: FloatArray) -> FloatArray:
+        at = np.stack([along, across])
+        found: FloatArray = map_coordinates(self.share, at, order=3, prefilter=False, mode="nearest")
+        return found
+
+
+def cells(axis: FloatArray, frame: FloatArray, length: FloatArray, middle: FloatArray) -> FloatArray:
+    """Centres (n, m, 9, 3) of the cells of leaves: midribs (n, m + 1, 3), frames (n, m, 3, 3), lengths and half widths
+    in the middle (n, m) of the pieces."""
+    place = (2.0 * np.arange(N_STRIPS) + 1.0) / N_STRIPS - 1.0
+    across = middle[..., np.newaxis] * place
+    along = axis[:, :-1] + 0.5 * length[..., np.newaxis] * frame[..., 0]
+    centers: FloatArray = along[:, :, np.newaxis] + across[..., np.newaxis] * frame[:, :, np.newaxis, :, 1]
+    return centers
