@@ -28,6 +28,7 @@ from phytofit.pipeline import run
 from phytofit.simulation import visible
 
 MIDRIBS_CM = (25.0, 34.4, 37.1, 44.8, 47.8, 52.6, 58.0, 61.9)  # of the data's README, "slightly too long"
+IN_MESH_CM = 1.5  # points farther from the mesh are of what it lacks: the plant had a ninth, dry leaf
 N_POINTS, NOISE_CM = 60_000, 0.3
 CAMERAS_DEG = (-35.0, 0.0, 35.0)  # azimuths, of the view from one side
 NEAR = 0.06  # of leaf length, within which a leaf counts as right
@@ -40,11 +41,15 @@ def turntable() -> None:
     mesh = plant.points / 10.0 * [-1.0, 1.0, 1.0]
     truth = phytofit.segment(phytofit.PointCloud(mesh, labels=plant.labels, name="mesh"), labelled=True)
     points = aligned(made.segmentation.cloud.points, mesh)
-    of_point = truth.labels[cKDTree(mesh).query(points)[1]]
-    found = score(made.segmentation.labels, of_point, 0.0)
+    gap, nearest = cKDTree(mesh).query(points)
+    there = gap < IN_MESH_CM
+    of_point = np.where(there, truth.labels[nearest], 0)
+    found = score(made.segmentation.labels[there], of_point[there], 0.0)
     print(
         f"turntable: {found.found} leaves, {found.true} in the mesh, {found.hits} with IoU over 0.5; "
-        f"IoU of the stem {found.stem:.2f}, of the leaves {found.leaves:.2f} on average (goal 0.85)"
+        f"IoU of the stem {found.stem:.2f}, of the leaves {found.leaves:.2f}, of all organs "
+        f"{(found.stem + found.true * found.leaves) / (1 + found.true):.2f} on average (goal 0.85); without "
+        f"{100 * np.mean(~there):.1f} % of the points, more than {IN_MESH_CM} cm off the mesh"
     )
     counted = np.zeros((len(truth.leaves), len(made.segmentation.leaves)))
     for i, leaf in enumerate(truth.leaves):

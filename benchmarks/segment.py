@@ -16,6 +16,7 @@ import trimesh
 from accuracy import DATA
 from cut_leaves import Plant, labelled_plants
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 
 import phytofit
 
@@ -95,6 +96,17 @@ def accuracy(each: bool) -> None:
     print(summary("labelled by hand", [s for name, found in sets.items() if name != "mccormick" for s in found]))
 
 
+def turned() -> None:
+    """The same clouds, without what is no organ, each turned at random."""
+    found = []
+    for number, plant in enumerate(labelled_plants()):
+        if plant.data_set != "mccormick":
+            organ = plant.labels > 0
+            points = Rotation.random(rng=number).apply(plant.points[organ])
+            found += [made for _, made in scores(iter([plant._replace(points=points, labels=plant.labels[organ])]))]
+    print(summary("turned at random", found))
+
+
 def unlabelled() -> None:
     """Plants whose organs are not labelled, but whose leaves can be counted."""
     path = DATA.parent / "prbonn_maize_seedling" / "03-13.ply"
@@ -126,10 +138,12 @@ def speed() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--each", action="store_true", help="print every cloud")
-    parser.add_argument("--part", choices=["accuracy", "unlabelled", "speed"], help="only this part")
+    parser.add_argument("--part", choices=["accuracy", "turned", "unlabelled", "speed"], help="only this part")
     chosen = parser.parse_args()
     if chosen.part in (None, "accuracy"):
         accuracy(chosen.each)
+    if chosen.part in (None, "turned"):
+        turned()
     if chosen.part in (None, "unlabelled"):
         unlabelled()
     if chosen.part in (None, "speed"):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -140,6 +141,20 @@ def test_a_leaf_that_can_t_be_fitted_keeps_its_length_and_is_not_tried_again(mad
     assert lengths == pytest.approx([leaf.length for leaf in first.segmentation.leaves])
     assert (out / "leaves" / "leaf_01" / "fit.json").exists()  # with another seed it could be fitted
     assert sum("not fitted" in flag for flag in other.flags) == leaves - 1
+
+
+def test_a_fit_that_leaves_most_of_the_points_out_is_not_the_leaf(made, tmp_path, monkeypatch):
+    shutil.copytree(made[0], tmp_path / "copy")
+
+    def badly(phytomer, **how):
+        result = fit(phytomer, **how)
+        return replace(result, estimate=replace(result.estimate, share=np.array([0.1, 0.3, 0.6])))
+
+    monkeypatch.setattr("phytofit.pipeline.fit", badly)
+    found = run(tmp_path / "copy" / "plant.ply", tmp_path / "copy" / "out", units="cm", up="z", seed=1, threads=1)
+    lengths = found.table[found.table["trait"] == "leaf_length"]
+    assert lengths["value"].tolist() == pytest.approx([leaf.length for leaf in found.segmentation.leaves])
+    assert all("not fitted: the model does not explain 60 % of the points" in flags for flags in lengths["flags"])
 
 
 def test_corrected_labels_are_taken_over(made, tmp_path):

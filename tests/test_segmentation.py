@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -100,7 +101,16 @@ def test_phytomers_are_a_leaf_and_its_piece_of_stem(five):
     for leaf, phytomer in zip(found.leaves, phytomers, strict=True):
         assert set(np.unique(phytomer.labels)) == {0, 1, 2}
         near = np.linalg.norm(phytomer.points - leaf.collar, axis=1) < 4.0 * found.stem_radius
-        np.testing.assert_array_equal(phytomer.labels == 0, near)  # there a leaf may hug the stem
+        assert not phytomer.labels[near].any()  # there a leaf may hug the stem
+        _, along, axis = along_path(phytomer.points, found.stem_path)
+        out = phytomer.points - axis
+        azimuth = np.rad2deg(np.arctan2(out[:, 1], out[:, 0]))
+        turn = np.abs((azimuth - leaf.azimuth + 180.0) % 360.0 - 180.0)
+        hugging = (phytomer.labels == 0) & ~near
+        assert hugging.any()
+        assert np.all(along[hugging] < leaf.collar_distance)
+        assert turn[hugging].max() < 90.0  # of the leaf's side; the stem leans
+        assert np.all(phytomer.labels[~near & (turn > 90.0) & (along < leaf.collar_distance)] == 1)
         assert np.sum(phytomer.labels == 2) <= leaf.n_points <= np.sum(phytomer.labels != 1)
         _, along, _ = along_path(phytomer.points[phytomer.labels != 2], found.stem_path)
         assert along.min() < leaf.collar_distance < along.max() + 1.0
@@ -274,3 +284,15 @@ def test_real_seedlings(name):
             for k in range(2, len(found.leaves) + 2)
         )
         assert best > 0.5
+
+
+@pytest.mark.skipif(not (DATA / "mccormick2016_turntable").exists(), reason="no data in ../shared/data")
+def test_a_plant_whose_innermost_leaf_is_as_round_as_its_stem_stands_on_its_base():
+    """Its leaves droop, which they would not do the other way round."""
+    file = next((DATA / "mccormick2016_turntable").glob("*.ply"))
+    mesh = trimesh.load(file, process=False)
+    points = np.asarray(trimesh.sample.sample_surface(mesh, 20_000, seed=0)[0])
+    found = phytofit.segment(phytofit.from_points(points, "mm", plausible_cm=(1.0, 500.0)))
+    assert found.stem_path[0, 2] < found.stem_path[-1, 2] - 20.0
+    assert found.stem_path[0, 2] < np.quantile(found.cloud.points[:, 2], 0.05)
+    assert len(found.leaves) == 8

@@ -38,6 +38,7 @@ __all__ = ["PlantRun", "plant_traits", "run"]
 
 PLANT_CM = (3.0, 500.0)  # sizes that are believed of a whole plant, from the seedling on
 KEY = "stage.json"
+MOST_OUTLIERS = 0.5  # share of a phytomer's points, beyond which what was fitted is not the leaf
 OF_SEGMENTATION = "from the segmentation"
 OF_THE_CUT = ("stem_length",)  # of a phytomer: where it was cut decides them
 Progress = Callable[[str, int, int], None]
@@ -192,7 +193,12 @@ def _fitted(
         if (target / KEY).is_file() and not (target / "fit.json").exists():
             shutil.rmtree(target)  # of an earlier run, that could not fit it
         try:
-            save_fit(fit(phytomer, species=species, up=found.up, **how), phytomer, folder / "leaves", name)
+            fitted = fit(phytomer, species=species, up=found.up, **how)
+            assert fitted.estimate is not None
+            outliers = float(fitted.estimate.share[2])
+            if outliers > MOST_OUTLIERS:
+                raise NoPhytomerError(f"the model does not explain {100 * outliers:.0f} % of the points")
+            save_fit(fitted, phytomer, folder / "leaves", name)
         except (NoPhytomerError, CloudError) as error:
             shutil.rmtree(target, ignore_errors=True)  # of an earlier run, that could fit it
             by_points = trait_table(found.cloud.name, [_by_its_points(found, leaf, str(error))])

@@ -1,7 +1,7 @@
 """Where the plant's stem begins: of all ends of the cloud the one from which it looks most like a plant.
 
-From the base, what the leaves share is round and straight, and the leaves part from it forwards.  From the tip of a
-leaf, the way to the other leaves begins flat, bends, and turns back at the collar.
+From the base, what the leaves share is round and straight, the leaves part from it forwards, and droop.  From the tip
+of a leaf, the way to the other leaves begins flat, bends, and turns back at the collar; and from the top, leaves rise.
 """
 
 from itertools import product
@@ -25,6 +25,7 @@ LEAST_BEFORE = 0.05  # of that neighbourhood's radius: how far its centre lies b
 LEAST_FORWARD = 0.2  # cosine: leaves part forwards from the way along a stem
 FOOT = 0.1  # of that distance: of the stem, that must be round in any case
 LEAST_FOOT = 8  # nodes of it
+LEAST_MIDRIB = 4  # nodes of it, to see whether a leaf droops
 PROBE = 0.05  # of that distance: from where to where a direction is measured
 STRAIGHT_WEIGHT = 0.5  # against roundness and forwardness
 HEIGHT_WEIGHT = 3.0  # of how low an end is, where up is known
@@ -95,7 +96,8 @@ def _likeness(graph: PlantGraph, root: int) -> tuple[float, FloatArray | None]:
     if before_it < LEAST_BEFORE or forward < LEAST_FORWARD:
         return -np.inf, None
     at_end = min(4.0 * before_it, 1.0)  # 1 at the end of a stem, 0 in its middle
-    return round_stem + at_end + forward + STRAIGHT_WEIGHT * straight, organs.path
+    droop = _droop(graph, distance, before, organs)
+    return round_stem + at_end + forward + droop + STRAIGHT_WEIGHT * straight, organs.path
 
 
 def _forward(graph: PlantGraph, distance: FloatArray, before: IntArray, organs: Organs) -> float:
@@ -110,3 +112,22 @@ def _forward(graph: PlantGraph, distance: FloatArray, before: IntArray, organs: 
         norm = float(np.linalg.norm(a) * np.linalg.norm(b))
         cosines.append(float(a @ b) / norm if norm > 0 else 0.0)
     return float(np.mean(cosines))
+
+
+def _droop(graph: PlantGraph, distance: FloatArray, before: IntArray, organs: Organs) -> float:
+    """By how much the leaves' outer halves point less along the stem than their inner halves, as cosines; a mean in
+    which longer leaves count more."""
+    stem = organs.path[-1] - organs.path[0]
+    stem = stem / max(float(np.linalg.norm(stem)), 1e-12)
+    bends, lengths = [0.0], [1e-12]
+    for tip, level in zip(organs.tips, organs.levels, strict=True):
+        path = path_to_root(before, tip)[::-1]
+        midrib = graph.points[path[int(np.searchsorted(distance[path], level)) :]]
+        if len(midrib) < LEAST_MIDRIB:
+            continue
+        middle = midrib[len(midrib) // 2]
+        inner, outer = middle - midrib[0], midrib[-1] - middle
+        inner, outer = (half / max(float(np.linalg.norm(half)), 1e-12) for half in (inner, outer))
+        bends.append(float((inner - outer) @ stem))
+        lengths.append(float(distance[tip] - level))
+    return float(np.average(bends, weights=lengths))

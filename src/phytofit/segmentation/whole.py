@@ -25,7 +25,9 @@ LEAST_SETTING = 500  # nodes
 N_ROOT_NODES = 3000  # enough to see by where the stem begins
 FAR = 4.0  # typical distances of nodes, beyond which a point is nobody's
 DOUBTFUL = 4.0  # stem radii about a collar: there the fit is to say what is stem and what is leaf
-PIECE = 5.0  # stem radii, at least, of stem above and below a phytomer's collar
+PIECE = 5.0  # stem radii, at least, of stem above a phytomer's collar
+HUGS = 10.0  # stem radii, at least, of stem below: so far a leaf may lie against its stem before it is seen to part
+BESIDE = 0.5  # cosine of the angle about the stem's axis within which a point is on a leaf's side
 
 
 @dataclass(frozen=True)
@@ -58,25 +60,28 @@ class Segmentation:
 
     def phytomers(self) -> list[PointCloud]:
         """Each leaf with the piece of stem around its collar, ready for the fit: labelled 1 stem, 2 leaf, and 0 about
-        the collar, where a leaf may hug the stem.
+        the collar, and below it on the leaf's side, where a leaf may hug the stem.
 
-        The piece reaches half way to the collars below and above, and at least 5 stem radii.
+        The piece reaches half way to the collars below and above, and at least 10 stem radii down and 5 up.
         """
+        points, radius = self.cloud.points, self.stem_radius
         on_stem = np.flatnonzero(self.labels == 1)
-        _, along, _ = along_path(self.cloud.points[on_stem], self.stem_path)
+        _, along, place = along_path(points[on_stem], self.stem_path)
         collars = np.array([leaf.collar_distance for leaf in self.leaves])
         ends = np.concatenate([[-np.inf], 0.5 * (collars[1:] + collars[:-1]), [np.inf]])
         clouds = []
         for i, leaf in enumerate(self.leaves):
-            low = min(ends[i], collars[i] - PIECE * self.stem_radius)
-            high = max(ends[i + 1], collars[i] + PIECE * self.stem_radius)
-            blade = np.flatnonzero(self.labels == leaf.rank + 1)
-            index = np.sort(np.concatenate([blade, on_stem[(along >= low) & (along <= high)]]))
-            labels = np.where(self.labels[index] == 1, 1, 2)
-            near = np.linalg.norm(self.cloud.points[index] - leaf.collar, axis=1) < DOUBTFUL * self.stem_radius
-            labels[near] = 0
+            low = min(ends[i], collars[i] - HUGS * radius)
+            high = max(ends[i + 1], collars[i] + PIECE * radius)
+            piece = (along >= low) & (along <= high)
+            below = piece & (along < collars[i]) & _beside(points[on_stem] - place, leaf, self.stem_path)
+            labels = np.where(self.labels == leaf.rank + 1, 2, 0)
+            labels[on_stem[piece]] = 1
+            index = np.flatnonzero(labels)
+            labels[on_stem[below]] = 0
+            labels[np.linalg.norm(points - leaf.collar, axis=1) < DOUBTFUL * radius] = 0
             name = f"{self.cloud.name}_leaf_{leaf.rank:02d}"
-            clouds.append(replace(self.cloud.take(index), labels=labels, name=name))
+            clouds.append(replace(self.cloud.take(index), labels=labels[index], name=name))
         return clouds
 
 
@@ -165,6 +170,16 @@ def segment(
     if n_unknown:
         notes.append(f"{n_unknown} of {len(cloud)} points belong to no organ")
     return Segmentation(cloud, labels, organs.path, organs.radius, upward, tuple(leaves), tuple(notes))
+
+
+def _beside(out: FloatArray, leaf: SegmentedLeaf, path: FloatArray) -> NDArray[np.bool_]:
+    """Which of the ways out (n, 3) from the stem's axis to points lead to the side of the leaf."""
+    inner = leaf.midrib[: max(3, len(leaf.midrib) // 2)]
+    side = (inner - along_path(inner, path)[2]).mean(axis=0)
+    stem = (path[-1] - path[0]) / np.linalg.norm(path[-1] - path[0])
+    side = side - (side @ stem) * stem  # the innermost leaves go on above the stem's end
+    beside: NDArray[np.bool_] = out @ side > BESIDE * np.linalg.norm(out, axis=1) * np.linalg.norm(side)
+    return beside
 
 
 def _found(points: FloatArray, up: FloatArray | None, n_nodes: int) -> tuple[PlantGraph, FloatArray, Organs]:
