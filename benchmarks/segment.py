@@ -24,6 +24,7 @@ HIT = 0.5  # intersection over union from which a leaf is found
 SIZES = (50_000, 300_000, 3_000_000)
 JITTER = 0.002  # of the plant's size, added to points that are repeated
 SYNTHETIC_POINTS = 60_000
+HEAD = "set                  clouds   exact  within 1  precision   recall  stem IoU  leaves IoU  slowest"
 
 
 class Score(NamedTuple):
@@ -82,7 +83,7 @@ def summary(name: str, found: list[Score]) -> str:
 
 
 def accuracy(each: bool) -> None:
-    print("set                  clouds   exact  within 1  precision   recall  stem IoU  leaves IoU  slowest")
+    print(HEAD)
     sets: dict[str, list[Score]] = {}
     for plant, made in scores(labelled_plants()):
         sets.setdefault(plant.data_set, []).append(made)
@@ -104,6 +105,7 @@ def turned() -> None:
             organ = plant.labels > 0
             points = Rotation.random(rng=number).apply(plant.points[organ])
             found += [made for _, made in scores(iter([plant._replace(points=points, labels=plant.labels[organ])]))]
+    print(HEAD)
     print(summary("turned at random", found))
 
 

@@ -36,12 +36,15 @@ def make(budget: Budget, out: Path) -> None:
     path = paths[0]
     tip = phytofit.fit(read(path)).organs[1].axis[-1]
     jobs = [
-        (path, how, number, method, budget.search if method == "paper" else {}, tip)
+        (path, how, number, method, budget.search if method == "paper" else {})
         for method in ("likelihood", "paper", "without a model")
         for how in (UNTOUCHED, *WAYS)
         for number in range(1, 2 if how == UNTOUCHED else budget.copies + 1)
     ]
     table = pd.DataFrame(run_all(length, jobs, "Fig. 7, leaf lengths"))
+    centers = table[["center_x", "center_y", "center_z"]].to_numpy()
+    table.insert(3, "tip_taken", np.linalg.norm(centers - tip, axis=1) < TIP_CM)
+    table = table.drop(columns=["center_x", "center_y", "center_z"])
     write_table(table, "fig7", out)
     summary(table, out)
     lengths(table, out)
@@ -60,12 +63,12 @@ def corrupted(path: Path, how: str, number: int) -> tuple[np.ndarray, np.ndarray
     return points, None
 
 
-def length(path: Path, how: str, number: int, method: str, settings: dict[str, int], tip: np.ndarray) -> dict[str, Any]:
-    """Leaf length of a copy, cm, from a random starting mean, NaN where none is found; and whether the sphere took
-    something of the `tip` (3,), which is that of the untouched leaf."""
+def length(path: Path, how: str, number: int, method: str, settings: dict[str, int]) -> dict[str, Any]:
+    """Leaf length of a copy, cm, from a random starting mean, NaN where none is found; and where the sphere was, NaN
+    where there was none."""
     points, center = corrupted(path, how, number)
-    taken = center is not None and bool(np.linalg.norm(center - tip) < TIP_CM)
-    row: dict[str, Any] = {"method": method, "how": how, "copy": number, "tip_taken": taken}
+    x, y, z = (np.nan,) * 3 if center is None else center.tolist()
+    row: dict[str, Any] = {"method": method, "how": how, "copy": number, "center_x": x, "center_y": y, "center_z": z}
     row |= {"leaf_length": np.nan, "low": np.nan, "high": np.nan, "flags": ""}
     try:
         if method == "without a model":

@@ -105,3 +105,41 @@ def test_a_hole_does_not_change_the_leaf(hole):
     assert abs(np.mean(errors)) < CHANCE * np.std(errors) / np.sqrt(len(errors))
     assert np.abs(errors).max() < 0.2
     assert np.mean(held) >= 0.6
+
+
+@pytest.mark.parametrize(
+    ("width", "share", "hole"), [(1.4, 0.5, (0.3, 0.7)), (1.4, 1.0, (0.4, 0.6)), (2.0, 0.5, (0.3, 0.7))]
+)
+def test_a_leaf_hardly_wider_than_its_noise_does_not_vanish_for_a_hole(width, share, hole):
+    """Its strips can't be told apart: points that noise carried sideways lie on the outer ones."""
+    widths = []
+    for seed in range(4):
+        fixed = {"leaf_length": LENGTH, "leaf_width": width, "stem_length_above": 8.0}
+        true = phytofit.simulate(fixed=fixed, n_points=6000, noise_cm=0.6, seed=seed)
+        leaf = true.organs[1]
+        piece, along = leaf.nearest(true.points)
+        place = (piece + along / leaf.segment_lengths[piece]) / len(leaf.frame)
+        gone = (place > hole[0]) & (place < hole[1]) & (true.labels == 2)
+        gone &= np.random.default_rng(seed).random(len(gone)) < share
+        fitted = phytofit.fit(true.points[~gone], "cm")
+        widths.append(next(t.value for t in fitted.traits if t.name == "leaf_width"))
+    assert min(widths) > 0.7 * width
+
+
+def test_holes_that_end_elsewhere_leave_more_or_less():
+    hidden = found_in(*made(3, (0.4, 0.6, -0.5, 0.5)))
+    assert np.all(hidden.smaller().share <= hidden.share)
+    assert np.all(hidden.larger().share >= hidden.share)
+    assert (hidden.smaller().share > EDGE).sum() < (hidden.share > EDGE).sum() < (hidden.larger().share > EDGE).sum()
+
+
+def test_intervals_know_that_a_hole_may_end_elsewhere(monkeypatch):
+    _, points = made(3, (0.25, 0.6, -0.55, 0.55))
+
+    def spread():
+        width = next(t for t in phytofit.fit(points, "cm").traits if t.name == "leaf_width")
+        return width.high - width.low
+
+    known = spread()
+    monkeypatch.setattr("phytofit.posterior._by_holes", lambda end, inverse: np.zeros_like(inverse))
+    assert known > 1.05 * spread()

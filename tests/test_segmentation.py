@@ -13,9 +13,11 @@ from typer.testing import CliRunner
 import phytofit
 from phytofit.cli import app
 from phytofit.models.organs import LEAF, STEM, Organ, SurfaceSampler, frames_along
-from phytofit.segmentation.graph import plant_graph, tips_of
+from phytofit.segmentation.graph import geodesics, plant_graph, tips_of
 from phytofit.segmentation.ground import find_ground
-from phytofit.segmentation.organs import along_path, centerline
+from phytofit.segmentation.growing import grow
+from phytofit.segmentation.organs import along_path, centerline, find_organs
+from phytofit.segmentation.root import _droop
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 SAME_LENGTH = 0.08  # relative; of a leaf between two samples of the same plant
@@ -284,6 +286,17 @@ def test_real_seedlings(name):
             for k in range(2, len(found.leaves) + 2)
         )
         assert best > 0.5
+
+
+def test_leaves_droop_seen_from_the_base_and_rise_seen_from_the_top(five):
+    graph = plant_graph(five[0], 3000)
+    drooping = []
+    for end in (np.argmin(graph.points[:, 2]), np.argmax(graph.points[:, 2])):
+        distance, before = geodesics(graph, int(end))
+        organs = find_organs(graph, distance, *grow(graph, distance))
+        drooping.append(_droop(graph, distance, before, organs))
+    assert drooping[0] > 0.1
+    assert drooping[1] < -0.1
 
 
 @pytest.mark.skipif(not (DATA / "mccormick2016_turntable").exists(), reason="no data in ../shared/data")

@@ -90,13 +90,13 @@ def _gaps(leaf: Organ, points: FloatArray, place: FloatArray) -> float:
     return float(clearly_lacking(found.astype(float), np.full(found.shape, typical)).mean())
 
 
-def clearly_lacking(found: FloatArray, wanted: FloatArray, smoothed: float = 1.0) -> NDArray[np.bool_]:
+def clearly_lacking(found: FloatArray, wanted: FloatArray) -> NDArray[np.bool_]:
     """Where next to none are found of the points that are wanted, or so few that neither chance nor the unevenness of
-    the rest explains it; numbers that were `smoothed` vary by chance so much less."""
+    the rest explains it."""
     share = found / np.maximum(wanted, 1e-9)
-    spread = np.maximum(np.sqrt(smoothed * wanted), _upper_spread(share) * wanted)
+    spread = np.maximum(np.sqrt(wanted), _upper_spread(share) * wanted)
     few = (share < GAP) & (wanted - found > CLEARLY * spread)
-    none = (share < EMPTY) & (wanted > smoothed * CLEARLY**2)
+    none = (share < EMPTY) & (wanted > CLEARLY**2)
     lacking: NDArray[np.bool_] = few | none
     return lacking
 

@@ -20,8 +20,8 @@ class Hidden:
     """Share of the points that was not seen, around a leaf as it lay when that was found out.
 
     The leaf's m pieces have nine strips each, from the right edge to the left.  ``share`` (m, 9) are the coefficients
-    of a cubic B-spline over these cells: without kinks, as a likelihood should be.  Beyond the middles of the outermost
-    it stays as it is there.
+    of a cubic B-spline over these cells: without kinks, as a likelihood should be.  Farther than a cell
+    beyond them it stays as it is there.
     """
 
     leaf: Organ

@@ -38,7 +38,7 @@ def find_holes(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     number = np.bincount(leaf.nearest(points)[0] * N_STRIPS + strip_of(leaf, points, N_STRIPS), minlength=m * N_STRIPS)
     cells = _smoothed(number.reshape(m, N_STRIPS).astype(float), 0)
     wanted = np.repeat(_smoothed(area * len(points) / area.sum(), 0)[:, np.newaxis] / N_STRIPS, N_STRIPS, axis=1)
-    wide = half > EDGE_ON * state.noise[1]
+    blurred = half <= EDGE_ON * state.noise[1]
     density = cells.sum(axis=1) / np.maximum(wanted.sum(axis=1), 1e-9)
     typical = float(np.quantile(density, TYPICAL))
     if typical == 0.0:  # hardly a point is the leaf's
@@ -51,7 +51,7 @@ def find_holes(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     apart = np.linalg.norm(across, axis=1) > stem.half_width.max() + OFF_STEM * max(state.noise[:2])
     looked_at = apart & (np.arange(m) < (seen[-1] if len(seen) else 0))
     hole = looked_at & (ratio < HOLE) & (expected - found > CLEARLY * np.sqrt(expected))
-    wide &= looked_at
+    wide = looked_at & ~blurred
     thirds, wanted_of_third = (numbers.reshape(m, 3, -1).sum(axis=2) for numbers in (cells, wanted))
     lacking = np.zeros(thirds.shape, bool)
     if wide.any():
@@ -66,6 +66,7 @@ def find_holes(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     share = np.where(lacking | rim, missing, 0.0)
     little = hole & (ratio < LITTLE)
     share[little] = np.maximum(share[little], 1.0 - ratio[little, np.newaxis])
+    share[blurred] = np.where(hole, 1.0 - ratio, 0.0)[blurred, np.newaxis]
     return Hidden(leaf, np.clip(share, 0.0, MOST_HIDDEN))
 
 

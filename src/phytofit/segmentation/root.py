@@ -27,7 +27,7 @@ FOOT = 0.1  # of that distance: of the stem, that must be round in any case
 LEAST_FOOT = 8  # nodes of it
 LEAST_MIDRIB = 4  # nodes of it, to see whether a leaf droops
 PROBE = 0.05  # of that distance: from where to where a direction is measured
-STRAIGHT_WEIGHT = 0.5  # against roundness and forwardness
+STRAIGHT_WEIGHT = 0.5  # against the others
 HEIGHT_WEIGHT = 3.0  # of how low an end is, where up is known
 DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
 

@@ -26,7 +26,7 @@ N_ROOT_NODES = 3000  # enough to see by where the stem begins
 FAR = 4.0  # typical distances of nodes, beyond which a point is nobody's
 DOUBTFUL = 4.0  # stem radii about a collar: there the fit is to say what is stem and what is leaf
 PIECE = 5.0  # stem radii, at least, of stem above a phytomer's collar
-HUGS = 10.0  # stem radii, at least, of stem below: so far a leaf may lie against its stem before it is seen to part
+HUGS = 10.0  # stem radii, at least, of stem below; so far a leaf may lie against its stem before it is seen to part
 BESIDE = 0.5  # cosine of the angle about the stem's axis within which a point is on a leaf's side
 
 
@@ -60,7 +60,7 @@ class Segmentation:
 
     def phytomers(self) -> list[PointCloud]:
         """Each leaf with the piece of stem around its collar, ready for the fit: labelled 1 stem, 2 leaf, and 0 about
-        the collar, and below it on the leaf's side, where a leaf may hug the stem.
+        the collar, and up to 10 stem radii below it on the leaf's side, where a leaf may hug the stem.
 
         The piece reaches half way to the collars below and above, and at least 10 stem radii down and 5 up.
         """
@@ -74,7 +74,8 @@ class Segmentation:
             low = min(ends[i], collars[i] - HUGS * radius)
             high = max(ends[i + 1], collars[i] + PIECE * radius)
             piece = (along >= low) & (along <= high)
-            below = piece & (along < collars[i]) & _beside(points[on_stem] - place, leaf, self.stem_path)
+            below = (along < collars[i]) & (along > collars[i] - HUGS * radius)
+            below &= _beside(points[on_stem] - place, leaf, self.stem_path)
             labels = np.where(self.labels == leaf.rank + 1, 2, 0)
             labels[on_stem[piece]] = 1
             index = np.flatnonzero(labels)
@@ -176,7 +177,8 @@ def _beside(out: FloatArray, leaf: SegmentedLeaf, path: FloatArray) -> NDArray[n
     """Which of the ways out (n, 3) from the stem's axis to points lead to the side of the leaf."""
     inner = leaf.midrib[: max(3, len(leaf.midrib) // 2)]
     side = (inner - along_path(inner, path)[2]).mean(axis=0)
-    stem = (path[-1] - path[0]) / np.linalg.norm(path[-1] - path[0])
+    stem = path[-1] - path[0]
+    stem = stem / max(float(np.linalg.norm(stem)), 1e-12)
     side = side - (side @ stem) * stem  # the innermost leaves go on above the stem's end
     beside: NDArray[np.bool_] = out @ side > BESIDE * np.linalg.norm(out, axis=1) * np.linalg.norm(side)
     return beside
