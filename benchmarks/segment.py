@@ -24,6 +24,9 @@ HIT = 0.5  # intersection over union from which a leaf is found
 SIZES = (50_000, 300_000, 3_000_000)
 JITTER = 0.002  # of the plant's size, added to points that are repeated
 SYNTHETIC_POINTS = 60_000
+# Leaves of tobacco, tomato and sorghum: precision and recall at IoU 0.5, and mean coverage, of PSegNet, a network
+# trained on such plants (Li, Li, Xiang and Pan, Plant Phenomics 2022, 9787643)
+PUBLISHED = f"{'PSegNet, published':46}{88:9} % {79:7} % {'-':>8} {0.83:10.2f}"
 HEAD = "set                  clouds   exact  within 1  precision   recall  stem IoU  leaves IoU  slowest"
 
 
@@ -95,6 +98,7 @@ def accuracy(each: bool) -> None:
     for name, found in sets.items():
         print(summary(name, found))
     print(summary("labelled by hand", [s for name, found in sets.items() if name != "mccormick" for s in found]))
+    print(PUBLISHED)
 
 
 def turned() -> None:
