@@ -1,5 +1,7 @@
 """Plants taken apart: synthetic ones whose organs are known exactly, real ones against labels."""
 
+import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -265,6 +267,9 @@ def test_the_command_writes_what_can_be_given_back(five, tmp_path):
     names = {"plant.ply", "phytomers", "leaves.csv", "segmentation.json", "segmentation.png"}
     assert {p.name for p in (out / "maize").iterdir()} == names
     assert len(list((out / "maize" / "phytomers").iterdir())) == 5
+    said = json.loads((out / "maize" / "segmentation.json").read_text())
+    assert said["input"]["sha256"] == hashlib.sha256((tmp_path / "maize.ply").read_bytes()).hexdigest()
+    assert said["settings"] == {"up": None, "n_nodes": 8000, "labelled": False}
     written = phytofit.read_cloud(out / "maize" / "plant.ply", "cm")
     assert np.array_equal(written.labels, found.labels)
     again = ["segment", out / "maize" / "plant.ply", "--units", "cm", "--labels", "label", "--out", tmp_path / "again"]

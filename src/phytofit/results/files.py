@@ -1,17 +1,21 @@
 """Files of results: whole or not at all, with names that do not collide."""
 
+import hashlib
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from phytofit.cloud import PointCloud
 from phytofit.errors import OutputError
 
-__all__ = ["prepare_folder", "result_names", "table_text", "whole_file", "whole_folder", "write_text"]
+__all__ = ["input_of", "prepare_folder", "result_names", "table_text", "whole_file", "whole_folder", "write_text"]
 
 DIGITS = 6  # significant, in tables; fit.json has all
 
@@ -28,6 +32,17 @@ def result_names(paths: Sequence[Path]) -> list[str]:
     ):
         names = [long if names.count(name) > 1 else name for name, long in zip(names, longer, strict=True)]
     return names
+
+
+def input_of(cloud: PointCloud) -> dict[str, Any]:
+    """What a result says of its input: the file, its unit, and the SHA-256 of the file, or of the points where there is
+    none."""
+    data = np.ascontiguousarray(cloud.points).tobytes() if cloud.source is None else cloud.source.read_bytes()
+    return {
+        "file": None if cloud.source is None else cloud.source.name,
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "unit": cloud.unit,
+    }
 
 
 def prepare_folder(folder: Path) -> Path:

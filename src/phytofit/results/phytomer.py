@@ -1,6 +1,5 @@
 """What a fit looks like on disk: one folder a cloud, and a tidy table."""
 
-import hashlib
 import json
 from collections.abc import Iterable
 from importlib.metadata import version
@@ -15,7 +14,7 @@ from phytofit.fitting import Fit
 from phytofit.models import mesh
 from phytofit.plots import plot_convergence, plot_fit
 from phytofit.recipe import recipe_of
-from phytofit.results.files import table_text, whole_folder
+from phytofit.results.files import input_of, table_text, whole_folder
 from phytofit.traits import Trait
 
 __all__ = ["COLUMNS", "save_fit", "trait_table"]
@@ -56,11 +55,7 @@ def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
     return {
         "phytofit": version("phytofit"),
         "cloud": name,
-        "input": {
-            "file": None if cloud.source is None else cloud.source.name,
-            "sha256": _hash(cloud),
-            "unit": cloud.unit,
-        },
+        "input": input_of(cloud),
         "species": result.species.name,
         "prior": {
             p.name: {"mean": p.mean, "std": p.std, "lower": _finite(p.lower), "upper": _finite(p.upper), "unit": p.unit}
@@ -124,9 +119,3 @@ def _finite(bound: float) -> float | None:
 
 def _unit(unit: str, result: Fit) -> str:
     return "rel" if result.relative and unit == "cm" else unit
-
-
-def _hash(cloud: PointCloud) -> str:
-    """SHA-256 of the file, or of the points where there is none."""
-    data = np.ascontiguousarray(cloud.points).tobytes() if cloud.source is None else cloud.source.read_bytes()
-    return hashlib.sha256(data).hexdigest()

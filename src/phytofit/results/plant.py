@@ -15,7 +15,7 @@ from phytofit.errors import InputError, OutputError
 from phytofit.formats import read_cloud, write_cloud
 from phytofit.plots import plot_reconstruction, plot_segmentation
 from phytofit.reconstruct import Reconstruction
-from phytofit.results.files import table_text, whole_folder
+from phytofit.results.files import input_of, table_text, whole_folder
 from phytofit.segmentation import Segmentation, SegmentedLeaf
 
 __all__ = ["leaf_table", "read_segmentation", "save_reconstruction", "save_segmentation"]
@@ -155,11 +155,12 @@ def read_segmentation(folder: str | Path) -> Segmentation:
         leaves = tuple(_leaf_of(leaf) for leaf in said["leaves"])
         path, up = np.array(said["stem_path"]), np.array(said["up"])
         name, radius, unit, notes = said["cloud"], float(said["stem_radius"]), said["unit"], tuple(said["notes"])
+        settings = dict(said["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file}: expected what phytofit segment writes ({type(error).__name__}: {error})") from None
     cloud = replace(read_cloud(file.with_name("plant.ply"), unit, plausible_cm=(0.0, np.inf)), name=name)
     assert cloud.labels is not None
-    return Segmentation(cloud, cloud.labels, path, radius, up, leaves, notes)
+    return Segmentation(cloud, cloud.labels, path, radius, up, leaves, notes, settings)
 
 
 def _leaf_of(said: dict[str, Any]) -> SegmentedLeaf:
@@ -173,6 +174,7 @@ def _segmented(result: Segmentation) -> dict[str, Any]:
     return {
         "phytofit": version("phytofit"),
         "cloud": result.cloud.name,
+        "input": input_of(result.cloud),
         "unit": result.cloud.unit,
         "stem_path": result.stem_path.tolist(),
         "stem_radius": result.stem_radius,
@@ -182,4 +184,5 @@ def _segmented(result: Segmentation) -> dict[str, Any]:
             for leaf in result.leaves
         ],
         "notes": list(result.notes),
+        "settings": result.settings,
     }

@@ -1,6 +1,7 @@
 """A plant's cloud taken apart: the one function that calls all the others, and what it returns."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,7 +38,7 @@ class Segmentation:
     ``cloud`` is what was segmented, ``labels`` (n,) of its points: 0 unknown, ground or pot, 1 stem, 2.. leaves
     counted from the base.  ``stem_path`` (k, 3) is the stem's axis from its base to the innermost leaf,
     ``stem_radius`` its typical radius, cm; ``up`` (3,) the direction that was stated or found; ``leaves`` by rank.
-    ``notes`` say what was done.
+    ``notes`` say what was done; ``settings`` repeat the run.
     """
 
     cloud: PointCloud
@@ -47,6 +48,7 @@ class Segmentation:
     up: FloatArray
     leaves: tuple[SegmentedLeaf, ...]
     notes: tuple[str, ...] = ()
+    settings: dict[str, Any] = field(default_factory=dict)
 
     @property
     def plant(self) -> PointCloud:
@@ -104,7 +106,7 @@ def segment(
         One plant with stem and leaves, in any orientation; ground and pot may be below it.
     up
         The upward direction where it is known, as for :func:`phytofit.fit`; else it is told by the plant: the stem's
-        base is the end that is round and from which the leaves part forwards.
+        base is the end that is round, and from which the leaves part forwards and droop.
     n_nodes
         Places that the cloud is thinned to; labels are carried back to all points.
     labelled
@@ -120,7 +122,7 @@ def segment(
     SettingError
         If `up` or `n_nodes` can't be used.
     """
-    direction = parse_up(up)
+    direction = stated = parse_up(up)
     if n_nodes < LEAST_SETTING:
         raise SettingError(f"segment: expected n_nodes >= {LEAST_SETTING}, got {n_nodes}")
     if len(cloud) < MIN_POINTS:
@@ -170,7 +172,8 @@ def segment(
     n_unknown = int(count[0])
     if n_unknown:
         notes.append(f"{n_unknown} of {len(cloud)} points belong to no organ")
-    return Segmentation(cloud, labels, organs.path, organs.radius, upward, tuple(leaves), tuple(notes))
+    settings = {"up": None if stated is None else stated.tolist(), "n_nodes": n_nodes, "labelled": labelled}
+    return Segmentation(cloud, labels, organs.path, organs.radius, upward, tuple(leaves), tuple(notes), settings)
 
 
 def _beside(out: FloatArray, leaf: SegmentedLeaf, path: FloatArray) -> NDArray[np.bool_]:
