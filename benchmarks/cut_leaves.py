@@ -75,11 +75,17 @@ def labelled_plants() -> Iterator[Plant]:
         if path.stem.startswith("nk"):  # its highest label is the pot
             labels[labels == labels.max()] = 0
         yield Plant("label3dmaize", path.stem, "", points, labels)
-    mesh = trimesh.load(DATA.parent / "mccormick2016_turntable" / "segmentedMesh.ply", process=False)
+    mesh, of_face = colored_mesh()
     drawn, face = trimesh.sample.sample_surface(mesh, MESH_POINTS, seed=0)
-    colors, number = np.unique(mesh.visual.vertex_colors[mesh.faces[face, 0], :3], axis=0, return_inverse=True)
+    yield Plant("mccormick", "mccormick", "", np.asarray(drawn), of_face[face])
+
+
+def colored_mesh() -> tuple[trimesh.Trimesh, np.ndarray]:
+    """The sorghum mesh, in mm, and the labels of its faces by their colours: 1 stem, others a leaf each."""
+    mesh = trimesh.load(DATA.parent / "mccormick2016_turntable" / "segmentedMesh.ply", process=False)
+    colors, number = np.unique(mesh.visual.vertex_colors[mesh.faces[:, 0], :3], axis=0, return_inverse=True)
     stem = int(np.flatnonzero((colors == STEM_COLOR).all(axis=1))[0])
-    yield Plant("mccormick", "mccormick", "", np.asarray(drawn), np.where(number == stem, 1, number + 2).ravel())
+    return mesh, np.where(number == stem, 1, number + 2).ravel()
 
 
 def rows_of(path: Path) -> tuple[np.ndarray, np.ndarray]:
