@@ -304,6 +304,35 @@ def test_leaves_droop_seen_from_the_base_and_rise_seen_from_the_top(five):
     assert drooping[1] < -0.1
 
 
+def iou(one, other):
+    return np.sum(one & other) / np.sum(one | other)
+
+
+def whorl(noise_cm=0.05):
+    """Points and labels of a stem with an open leaf and three leaves at its end, whose lower thirds touch: a blade is as
+    wide as the gaps between its neighbours there."""
+    up = np.linspace(0.0, 30.0, 25)[:, np.newaxis] * np.array([0.0, 0.0, 1.0])
+    organs = [Organ(STEM, up, frames_along(up, np.array([0.0, 1.0, 0.0])), np.full(25, 0.8))]
+    s = np.linspace(0.0, 1.0, 25)[:, np.newaxis]
+    for azimuth, foot, rise in ((0.0, 15.0, 0.6), (0.5, 30.0, 1.0), (2.6, 30.0, 1.0), (4.7, 30.0, 1.0)):
+        out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        axis = np.array([0.0, 0.0, foot]) + 1.0 * out + 30.0 * s * (0.7 * s**2 * out + rise * np.array([0.0, 0.0, 1.0]))
+        side = np.cross([0.0, 0.0, 1.0], out)
+        width = 2.2 * np.sin(np.pi * np.linspace(0.35, 1.0, 25)) + 0.02
+        organs.append(Organ(LEAF, axis, frames_along(axis, side), width))
+    points, number = SurfaceSampler(20_000, 0, even=False).draw(organs)
+    return points + np.random.default_rng(0).normal(0.0, noise_cm, points.shape), number.astype(int) + 1
+
+
+def test_leaves_of_a_whorl_share_it():
+    points, labels = whorl()
+    found = phytofit.segment(cloud_of(points), up=[0.0, 0.0, 1.0])
+    assert len(found.leaves) == 4
+    overlap = np.array([[iou(labels == true, found.labels == n) for n in (3, 4, 5)] for true in (3, 4, 5)])
+    assert np.all(overlap.max(axis=1) > 0.7)
+    assert overlap.max(axis=1).mean() > 0.75  # 0.69 if they went to the leaf that is next over the surface
+
+
 @pytest.mark.skipif(not (DATA / "mccormick2016_turntable").exists(), reason="no data in ../shared/data")
 def test_a_plant_whose_innermost_leaf_is_as_round_as_its_stem_stands_on_its_base():
     """Its leaves droop, which they would not do the other way round."""

@@ -20,6 +20,8 @@ THIN = 0.3  # of the sections of what leaves share, the share that is the stem's
 WHORL = 1.25  # times thicker than those, it is no longer stem
 FLAT = 0.4  # thin over wide of the sections: what leaves share with less is a blade, not a stem
 STICKS_OUT = 1.8  # stem radii from the axis, and beyond: a leaf's base
+OVER_SURFACE = 0.5  # what a way over the surface of a whorl counts, beside the gap from the straight way to the stem
+BASE = 7.5  # typical distances of neighbours, of a leaf where it comes out of the whorl, by which it is placed
 SLICE = 2.5  # typical distances of neighbours, thickness of a section
 
 
@@ -55,8 +57,13 @@ def find_organs(graph: PlantGraph, distance: FloatArray, regions: list[Region], 
         labels[nodes] = len(tips) + 1
     path, radius, top = _axis(graph, distance, stem)
     gap, _, _ = along_path(graph.points, path)
+    grown = labels.copy()
     out = (labels == 1) & ((gap > STICKS_OUT * radius + 0.5 * graph.spacing) | (distance > top))
     _give_away(graph, labels, out)
+    whorl = np.flatnonzero(out & (distance > top) & (labels > 1))
+    parted = {n: np.flatnonzero(grown == n) for n in range(2, len(tips) + 2)}
+    above = {n: own for n, own in parted.items() if len(own) and distance[own].min() >= top}
+    _share_whorl(graph, distance, labels, whorl, above, path[-1])
     return Organs(labels, path, radius, tuple(tips), tuple(levels))
 
 
@@ -216,3 +223,30 @@ def _give_away(graph: PlantGraph, labels: NDArray[np.int64], out: NDArray[np.boo
     gap, _, source = dijkstra(inside, directed=False, indices=sources, min_only=True, return_predecessors=True)
     reached = np.isfinite(gap) & out[part]
     labels[part[reached]] = labels[part[source[reached]]]
+
+
+def _share_whorl(
+    graph: PlantGraph,
+    distance: FloatArray,
+    labels: NDArray[np.int64],
+    whorl: IntArray,
+    leaves: dict[int, IntArray],
+    end: FloatArray,
+) -> None:
+    """Share the nodes of a whorl out among its leaves, of which `leaves` has the nodes beyond it, by label.
+
+    Rolled around each other they touch all over, so which is next over the surface says little.  A leaf comes straight
+    from the stem's end (3,).
+    """
+    nodes = whorl[np.isin(labels[whorl], list(leaves))]
+    if len(leaves) < 2 or len(nodes) == 0:
+        return
+    cost = np.empty((len(leaves), len(nodes)))
+    for row, own in enumerate(leaves.values()):
+        first = graph.points[own[distance[own] <= distance[own].min() + BASE * graph.spacing]].mean(axis=0)
+        part = np.concatenate([nodes, own])
+        inside = csr_array(graph.weights[part][:, part])
+        way = dijkstra(inside, directed=False, indices=np.arange(len(nodes), len(part)), min_only=True)[: len(nodes)]
+        cost[row] = along_path(graph.points[nodes], np.array([first, end]))[0] + OVER_SURFACE * way
+    reached = np.isfinite(cost).any(axis=0)
+    labels[nodes[reached]] = np.array(list(leaves))[np.argmin(cost[:, reached], axis=0)]
