@@ -202,7 +202,7 @@ def sweeps(pool: ProcessPoolExecutor, phytomers: int, n_peers: int) -> None:
         print(
             f"{'':>8}"
             + "".join(f"{trait:>18}" for trait in TRAITS)
-            + "   covered: each     all  unflagged   flagged  refused    paper's  model-free"
+            + "   covered: each      all  unflagged   flagged  refused    paper's  model-free"
         )
         shown = []
         for step in sweep.steps:
@@ -215,7 +215,7 @@ def sweeps(pool: ProcessPoolExecutor, phytomers: int, n_peers: int) -> None:
             median, most = (np.quantile(errors, q, axis=0) if len(errors) else np.full(4, np.nan) for q in (0.5, 0.95))
             cells = "".join(f"{a:9.2f} ({b:6.2f})" for a, b in zip(median, most, strict=True))
             held = [100 * np.nanmean(c) if len(c) else np.nan for c in (covered, plain)]
-            each = " ".join(f"{share:3.0f}" for share in 100 * np.mean(covered, axis=0)) if len(covered) else ""
+            each = " ".join(f"{share:3.0f}" for share in 100 * np.nanmean(covered, axis=0)) if len(covered) else ""
             others = np.full(2, np.nan)
             if n_peers:
                 others = np.nanmedian(np.abs([o.peers for o in those[:n_peers]]), axis=0)
@@ -238,7 +238,7 @@ def print_where_it_works(sweep: Sweep, outcomes: list[Outcome]) -> None:
     steps = ", ".join(f"{step:g}" for step in sweep.works)
     for kind, those in (("all", outcomes), ("unflagged", [o for o in outcomes if not o.flags])):
         if those:
-            held = 100 * np.mean([o.covered for o in those], axis=0)
+            held = 100 * np.nanmean([o.covered for o in those], axis=0)
             each = ", ".join(f"{trait} {share:.1f} %" for trait, share in zip(TRAITS, held, strict=True))
             print(f"  at {steps}, {kind} {len(those)}: {each}", flush=True)
 

@@ -309,8 +309,7 @@ def iou(one, other):
 
 
 def whorl(noise_cm=0.05):
-    """Points and labels of a stem with an open leaf and three leaves at its end, whose lower thirds touch: a blade is as
-    wide as the gaps between its neighbours there."""
+    """Points and labels of a stem with an open leaf and three leaves at its end, whose lower thirds touch."""
     up = np.linspace(0.0, 30.0, 25)[:, np.newaxis] * np.array([0.0, 0.0, 1.0])
     organs = [Organ(STEM, up, frames_along(up, np.array([0.0, 1.0, 0.0])), np.full(25, 0.8))]
     s = np.linspace(0.0, 1.0, 25)[:, np.newaxis]
@@ -325,6 +324,7 @@ def whorl(noise_cm=0.05):
 
 
 def test_leaves_of_a_whorl_share_it():
+    """By where they come from; how much the way over the surface counts beside that is for real plants to say."""
     points, labels = whorl()
     found = phytofit.segment(cloud_of(points), up=[0.0, 0.0, 1.0])
     assert len(found.leaves) == 4
