@@ -61,7 +61,7 @@ def turntable() -> None:
             a, b = of_point == leaf.rank + 1, made.segmentation.labels == other.rank + 1
             counted[i, j] = np.sum(a & b) / max(1, np.sum(a | b))
     lengths = made.table[made.table["trait"] == "leaf_length"].set_index("rank")
-    ways, off, all_ways = ways_along_edges(), [], []
+    ways, off, all_ways, whole = ways_along_edges(), [], [], []
     print(
         "leaf of the mesh: length along it, cm (shortest way along edges from the stem to the farthest point, and the"
     )
@@ -72,11 +72,16 @@ def turntable() -> None:
         from_stem, apart, longest = ways[int(label)]
         off.append(100.0 * (row["value"] / true - 1.0))
         all_ways.append(longest)
+        whole.append(apart == from_stem)
         print(
             f"  {i + 1}: {true:5.1f} ({from_stem:4.1f}, {apart:4.1f})   leaf {j + 1}: {row['value']:5.1f} "
             f"[{row['low']:.1f}, {row['high']:.1f}]   {off[-1]:+.0f} %   {row['flags'] or ''}"
         )
-    print(f"within {100 * NEAR:g} %: {np.sum(np.abs(off) <= 100 * NEAR)} of {len(off)}")
+    near, free = np.abs(off) <= 100 * NEAR, np.array(whole)
+    print(
+        f"within {100 * NEAR:g} %: {near.sum()} of {len(near)}; of those that touch no organ but the stem, all of "
+        f"which can be seen: {near[free].sum()} of {free.sum()}"
+    )
     print("midribs in the data's README, cm, and the shortest ways along edges from a tip to what is farthest from it:")
     for lengths_cm in (MIDRIBS_CM, sorted(all_ways)):
         print("  " + ", ".join(f"{length:.1f}" for length in lengths_cm))
