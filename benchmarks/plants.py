@@ -62,6 +62,7 @@ def turntable() -> None:
             counted[i, j] = np.sum(a & b) / max(1, np.sum(a | b))
     lengths = made.table[made.table["trait"] == "leaf_length"].set_index("rank")
     ways, off, all_ways, whole = ways_along_edges(), [], [], []
+    fitted, along_mesh = [], []
     print(
         "leaf of the mesh: length along it, cm (shortest way along edges from the stem to the farthest point, and the"
     )
@@ -71,6 +72,8 @@ def turntable() -> None:
         label = np.bincount(plant.labels[truth.labels == truth.leaves[i].rank + 1]).argmax()
         from_stem, apart, longest = ways[int(label)]
         off.append(100.0 * (row["value"] / true - 1.0))
+        fitted.append(row["value"])
+        along_mesh.append(true)
         all_ways.append(longest)
         whole.append(apart == from_stem)
         print(
@@ -85,6 +88,8 @@ def turntable() -> None:
     print("midribs in the data's README, cm, and the shortest ways along edges from a tip to what is farthest from it:")
     for lengths_cm in (MIDRIBS_CM, sorted(all_ways)):
         print("  " + ", ".join(f"{length:.1f}" for length in lengths_cm))
+    stated = np.array(fitted)[np.argsort(along_mesh)] / MIDRIBS_CM - 1.0
+    print(f"fits beside the former, in the order of length along the mesh: {np.sum(np.abs(stated) <= NEAR)} are near")
 
 
 def ways_along_edges() -> dict[int, tuple[float, float, float]]:
