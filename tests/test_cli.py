@@ -248,7 +248,8 @@ def test_recipe_prints_every_setting_as_json():
     done = run("recipe")
     assert done.exit_code == 0
     recipe = json.loads(done.output)
-    assert recipe["fit"]["n_points"] == 5000
+    assert recipe["method_paper"]["n_points"] == 5000
+    assert recipe["method_likelihood"]["n_points"] == 10_000
     assert recipe["method_paper"]["n_samples"] == 500
     assert recipe["method_paper"]["n_generations"] == 10
     assert recipe["method_likelihood"]["n_samples"] == 60

@@ -138,17 +138,17 @@ class Fit:
         return np.inf if self.relative else CHORD_CM
 
     def _not_seen(self, name: str) -> float:
-        """What of a trait belongs to a tip that was not seen: the interval's low end is without it."""
+        """What of a trait belongs to a tip that was not seen, or where there are no points though the leaf's would be
+        expected: the interval's low end is without it."""
         assert self.estimate is not None
-        if name not in OPEN_WITHOUT_TIP or self.estimate.seen == 1.0:
+        until_share = self.estimate.sighting.end if self.estimate.too_long else self.estimate.seen
+        if name not in OPEN_WITHOUT_TIP or until_share == 1.0:
             return 0.0
         leaf = self._organs_of(self.x)[1]
         pieces = leaf.segment_lengths
         if name == "leaf_area":
             pieces = pieces * (leaf.half_width[1:] + leaf.half_width[:-1])
-        until = np.interp(
-            self.estimate.seen * len(pieces), np.arange(len(pieces) + 1), np.append(0.0, np.cumsum(pieces))
-        )
+        until = np.interp(until_share * len(pieces), np.arange(len(pieces) + 1), np.append(0.0, np.cumsum(pieces)))
         return float(pieces.sum() - until)
 
     def _ends(self) -> Ends:
@@ -193,7 +193,7 @@ def fit(
     method: str = "likelihood",
     distance: str | None = None,
     n_samples: int | None = None,
-    n_points: int = 5000,
+    n_points: int | None = None,
     n_generations: int | None = None,
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
@@ -218,7 +218,7 @@ def fit(
     distance : what the paper's method minimises: hausdorff (its own), quantile, chamfer, labels
     n_samples, n_generations : of the cross-entropy search: 500 candidates in each of 10 generations for "paper",
         60 in each of 4 for "likelihood", which is refined afterwards
-    n_points : to which the cloud is thinned; for "paper" also of each candidate
+    n_points : to which the cloud is thinned: 10,000 for "likelihood"; 5,000 for "paper", and also of each candidate
     elite_fraction, covariance_noise : see :class:`phytofit.CrossEntropy`
     random_start : start the search from means drawn from the prior (as in Fig. 7d), not from the prior's and, for
         the stem's lengths, from the start pose
@@ -246,23 +246,26 @@ def fit(
     elif units not in (None, cloud.unit):
         raise SettingError(f"units: {cloud.name} was read in {cloud.unit}, got {units!r}; leave units out")
     search: dict[str, Any] = {"elite_fraction": elite_fraction, "covariance_noise": covariance_noise}
-    given = {"n_samples": n_samples, "n_generations": n_generations, "distance": distance}
+    given = {"n_samples": n_samples, "n_points": n_points, "n_generations": n_generations, "distance": distance}
     search |= {name: value for name, value in given.items() if value is not None}
     used = {**_defaults(METHODS[method]), **search}
     CrossEntropy(species.space, **{name: value for name, value in used.items() if name in SEARCH})  # checks them
     if not stem_above:
         species = species.leading(N_PAPER)
     found = prepare(
-        cloud, species, n_points=n_points, up=direction, with_outliers=method == "likelihood", seed_points=seed_points
+        cloud,
+        species,
+        n_points=used["n_points"],
+        up=direction,
+        with_outliers=method == "likelihood",
+        seed_points=seed_points,
     )
     means = [mean_at(start, species.leading(N_SEARCHED).space) for start in found.starts]
     if random_start:
         means[0] = _random_mean(species.leading(N_SEARCHED).space, seed)
     one_thread = threadpool_limits(limits=1, user_api="blas")  # more would round sums in another order
     with one_thread, ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
-        result = METHODS[method](
-            found, species, means, n_points=n_points, seed=seed, executor=executor, progress=progress, **search
-        )
+        result = METHODS[method](found, species, means, seed=seed, executor=executor, progress=progress, **search)
     pose = found.home @ result.pose
     pose[:3, 3] *= found.scale
     result = replace(
@@ -277,7 +280,6 @@ def fit(
         settings={
             "method": method,
             **used,
-            "n_points": n_points,
             "random_start": random_start,
             "stem_above": stem_above,
             "up": None if direction is None else direction.tolist(),
@@ -292,12 +294,12 @@ def fit_paper(
     species: Species,
     means: Sequence[FloatArray],
     *,
-    n_points: int,
     seed: int,
     executor: Executor,
     progress: Callable[[Generation], None] | None,
     distance: str = "hausdorff",
     n_samples: int = 500,
+    n_points: int = 5000,
     n_generations: int = 10,
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
@@ -344,11 +346,11 @@ def fit_likelihood(
     species: Species,
     means: Sequence[FloatArray],
     *,
-    n_points: int,
     seed: int,
     executor: Executor,
     progress: Callable[[Generation], None] | None,
     n_samples: int = 60,
+    n_points: int = 10_000,
     n_generations: int = 4,
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
@@ -417,6 +419,7 @@ def _remarked(result: Fit) -> Fit:
         outlier_share=float(made.share[2]),
         midrib_seen=made.seen,
         tip_seen=made.tip_seen,
+        too_long=made.too_long,
         scale=result.scale,
     )
     return replace(result, flags=(*result.flags, *flags))

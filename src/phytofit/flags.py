@@ -35,6 +35,7 @@ BOUNDED = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width", "stem_dia
 NEAR_BOUND = 1e-6
 TIP_DOUBTFUL = "whether the tip was seen can't be told: the leaf may be longer"
 BEYOND_TIP = "{:.0f} points near the leaf's tip are not explained: the leaf may go on there"
+TOO_LONG = "{:.0f} points would be expected in the last {:.0f} % of the leaf, where none is: it may end sooner"
 TIP_NOT_SEEN = "the tip was not seen: the leaf's length follows from its taper, and may be longer"
 
 
@@ -46,7 +47,8 @@ class Sighting:
     ``stem_points`` number of points on the stem; ``sectors`` share of the stem's circumference with points;
     ``gaps`` share of the blade (in sections and three strips each, without its ends) that clearly has no points where
     other parts have; ``beyond`` number of points near the leaf's tip that are of no organ, 0 if there are not more than
-    by chance.
+    by chance; ``end`` share of the midrib at which the leaf's last point lies, and ``short`` how many more would be
+    expected beyond it.
     """
 
     sections: FloatArray
@@ -54,6 +56,8 @@ class Sighting:
     sectors: float
     gaps: float
     beyond: float
+    end: float
+    short: float
 
     @property
     def leaf(self) -> float:
@@ -78,7 +82,9 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
     sector = np.bincount(((angle + np.pi) / (2 * np.pi) * N_SECTORS).astype(int) % N_SECTORS, minlength=N_SECTORS)
     shown = np.mean(sector > SEEN_DENSITY * np.quantile(sector, 0.75)) if len(stem_points) else 0.0
     beyond = _beyond_tip(likelihood, state, scores)
-    return Sighting(found / typical, float(on_stem.sum()), float(shown), gaps, float(beyond))
+    end = float(across_leaf(likelihood, state)[0][on_leaf > 0.5].max(initial=0.0))
+    short = float(on_leaf.sum() * (1.0 - place[on_leaf > 0.5].max(initial=0.0)))
+    return Sighting(found / typical, float(on_stem.sum()), float(shown), gaps, float(beyond), end, short)
 
 
 def _gaps(leaf: Organ, points: FloatArray, place: FloatArray) -> float:
@@ -165,14 +171,18 @@ def flags_of(
     outlier_share: float,
     midrib_seen: float,
     tip_seen: bool,
+    too_long: bool,
     scale: float = 1.0,
 ) -> Iterator[str]:
     """The remarks on a fit: parameters x (k,), noise (2,) or more on stem and leaf, share of outliers, share of the
-    midrib that was seen, and whether its tip clearly was; `scale` input lengths make a cm."""
+    midrib that was seen, whether its tip clearly was, and whether points end before it; `scale` input lengths make a
+    cm."""
     if midrib_seen < 1.0:
         yield TIP_NOT_SEEN
     elif not tip_seen:
         yield TIP_DOUBTFUL
+    if too_long:
+        yield TOO_LONG.format(seen.short, 100.0 * (1.0 - seen.end))
     if seen.beyond:
         yield BEYOND_TIP.format(seen.beyond)
     yield from _of_what_was_seen(seen)

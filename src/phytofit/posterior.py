@@ -23,6 +23,7 @@ from phytofit.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, Eva
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
 from phytofit.species import Species
+from phytofit.tip import blunt_end
 
 __all__ = ["DITHER_CM", "Estimate", "estimate"]
 
@@ -40,7 +41,7 @@ LEAST_KNOWN = 1e-9  # information on an entry of theta, below which it is none: 
 DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its twelve parameters gain six by chance, and cost more
-TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
+TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which another end must fit better: by chance 1 in 1,300, 1 in 80
 CLEARLY_BETTER = 5.0  # nats, by which another beginning of a richer leaf must fit better
 ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
@@ -58,14 +59,14 @@ class Estimate:
     ``x`` (k,) with ``covariance`` (k, k) of its error; ``pose`` (4, 4) from the model's frame to the cloud's;
     ``noise`` (3,) cm: on the stem, on the leaf, and what the leaf's thickness adds across it; ``share`` (3,) of stem,
     leaf and outliers; ``seen``: share of the midrib that was seen, 1 unless the tip is missing; ``tip_seen``: whether
-    it clearly is not; ``log_p`` (n,) of the points; ``evidence``: Laplace's approximation of the log probability of
-    the cloud, up to a constant of the cloud; ``inflation``: how many times more the errors vary than those of
-    independent points would; ``misfit_cm``: how far the blade's surface lies off the model's, as the errors that
-    neighbours share say; ``width_misfit``: by what share its width is off the model's, place by place;
-    ``correlated_cm``: how far errors of neighbours on the leaf are correlated, 0 if they are not;
-    ``rival`` (m,): parameters of the other model, if it is about as probable;
-    ``quantile``: standard errors to either side of a 95 % interval, Student's; ``sighting``: what of the phytomer the
-    cloud shows; ``dithered``: whether noise was added to the points, which had none.
+    it clearly is not; ``too_long``: whether the leaf's points clearly end before its tip; ``log_p`` (n,) of the points;
+    ``evidence``: Laplace's approximation of the log probability of the cloud, up to a constant of the cloud;
+    ``inflation``: how many times more the errors vary than those of independent points would; ``misfit_cm``: how far
+    the blade's surface lies off the model's, as the errors that neighbours on it share say, and those on the stem do
+    not; ``width_misfit``: by what share its width is off the model's, place by place; ``correlated_cm``: how far errors
+    of neighbours on the leaf are correlated, 0 if they are not; ``rival`` (m,): parameters of the other model, if it is
+    about as probable; ``quantile``: standard errors to either side of a 95 % interval, Student's; ``sighting``: what of
+    the phytomer the cloud shows; ``dithered``: whether noise was added to the points, which had none.
     """
 
     x: FloatArray
@@ -75,6 +76,7 @@ class Estimate:
     share: FloatArray
     seen: float
     tip_seen: bool
+    too_long: bool
     log_p: FloatArray
     error: float
     evidence: float
@@ -287,7 +289,13 @@ def _choice(found: Sequence[_End]) -> _Chosen:
     that makes the points clearly more probable."""
     dependence = score_dependence(found[-1].likelihood, found[-1].state)  # the richest: least misfit
     fits = [end.fit_of_points / dependence.inflation for end in found]
-    gains = [fits[i | 1] - fits[i & ~1] for i in range(len(found))]
+    gains = [0.0] * len(found)  # by a missing tip
+    for whole in range(0, len(found), 2):
+        gain = fits[whole + 1] - fits[whole]
+        if gain > TIP_DOUBTFUL:  # if the leaf's end says so too, not only its shape elsewhere
+            end = found[whole]
+            gain = min(gain, blunt_end(end.likelihood, end.state, end.at.scores) / dependence.inflation)
+        gains[whole] = gains[whole + 1] = gain
     odds = [0.0, 0.0, RARE, RARE]
     evidence = [_evidence(end, dependence.inflation) + o for end, o in zip(found, odds, strict=False)]
     backed = [e if i % 2 == 0 or gains[i] > TIP_MISSING else -np.inf for i, e in enumerate(evidence)]
@@ -408,7 +416,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     likelihood, state, free, at = end.likelihood, end.state, end.free, end.at
     k = state.n_parameters
     covariance = np.zeros((len(free), len(free)))
-    inverse = pinvh(_curvature(end))
+    inverse = _inverse(_curvature(end), _held_at_bounds(end)[free])
     left = max(
         dependence.n_independent - free.sum(), LEAST_LEFT * dependence.n_independent
     )  # a fit takes some errors up
@@ -424,11 +432,12 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         share=state.share,
         seen=state.seen,
         tip_seen=state.seen == 1.0 and not chosen.tip_doubtful and not seen.beyond,
+        too_long=state.seen == 1.0 and seen.short > TIP_MISSING * dependence.inflation,
         log_p=at.log_p,
         error=at.error,
         evidence=chosen.evidence,
         inflation=dependence.inflation,
-        misfit_cm=float(np.sqrt(dependence.leaf.correlation) * np.hypot(*state.noise[1:])),
+        misfit_cm=_misfit(dependence, state.noise),
         width_misfit=width_misfit(likelihood, state, at.scores, dependence.leaf),
         correlated_cm=dependence.leaf.reach_cm,
         rival=chosen.rival,
@@ -438,6 +447,30 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         sighting=seen,
         dithered=dithered,
     )
+
+
+def _held_at_bounds(end: _End) -> NDArray[np.bool_]:
+    """Which entries of theta would be beyond their bounds, were there none; not angles, for which 0 is no end."""
+    theta, likelihood = end.state.theta, end.likelihood
+    gradient = _gradient(likelihood, end.state, end.at)
+    held = np.where(gradient > 0.0, theta <= likelihood.lower, theta >= likelihood.upper)
+    held[: end.state.n_parameters] &= np.array(likelihood.space.units) != "deg"
+    return held
+
+
+def _inverse(curvature: FloatArray, held: NDArray[np.bool_]) -> FloatArray:
+    """Of the curvature (m, m) with the entries `held` at their bounds: the others don't follow them."""
+    apart = np.where(held[:, np.newaxis] | held, np.diag(np.diag(curvature)), curvature)
+    inverse: FloatArray = pinvh(apart)
+    return inverse
+
+
+def _misfit(dependence: Dependence, noise: FloatArray) -> float:
+    """How far, cm, the blade's surface lies off the model's: by what errors of neighbours on it share beyond what those
+    on the stem do, for a sensor's are on both, and are in the covariance."""
+    shared = dependence.leaf.correlation * float(noise[1] ** 2 + noise[2] ** 2)
+    of_sensor = dependence.stem.correlation * float(noise[0] ** 2)
+    return float(np.sqrt(max(0.0, shared - of_sensor)))
 
 
 def _by_holes(end: _End, inverse: FloatArray) -> FloatArray:

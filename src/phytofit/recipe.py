@@ -6,7 +6,7 @@ from typing import Any
 
 from phytofit.cloud import remove_outliers, thin
 from phytofit.distances import chamfer, hausdorff, labelled_hausdorff, quantile_hausdorff
-from phytofit.fitting import Fit, fit, fit_likelihood, fit_paper
+from phytofit.fitting import METHODS, Fit, fit, fit_likelihood, fit_paper
 from phytofit.objectives import PaperObjective
 from phytofit.reconstruct import reconstruct
 from phytofit.segmentation import segment
@@ -34,7 +34,8 @@ NOT_SETTINGS = {
     "units",
     "starts",
 }  # inputs, and what does not change the result
-FROM_FIT = {"n_points", "seed", "distance"}  # fit hands these on
+BY_METHOD, BY_FIT = {"n_points", "seed", "distance"}, {"seed", "distance"}  # that a method, or fit, hands on
+HANDED_ON: dict[Callable[..., Any], set[str]] = {fit: set(), **dict.fromkeys(METHODS.values(), BY_FIT)}
 
 
 def defaults(function: Callable[..., Any]) -> dict[str, Any]:
@@ -47,7 +48,7 @@ def recipe() -> dict[str, dict[str, Any]]:
     """All settings with their defaults: ``{step: {setting: value}}``."""
     found = {}
     for step, function in STEPS.items():
-        handed_on = set() if function is fit else FROM_FIT
+        handed_on = HANDED_ON.get(function, BY_METHOD)
         found[step] = {k: v for k, v in defaults(function).items() if k not in NOT_SETTINGS | handed_on}
     return {step: settings for step, settings in found.items() if settings}
 

@@ -80,8 +80,12 @@ def fit_command(
         int | None, typer.Option(help=f"Candidates a generation of the search; by default {_by_method('n_samples')}.")
     ] = None,
     points: Annotated[
-        int, typer.Option(help="Points of the cloud after thinning; for --method paper also of a candidate.")
-    ] = FIT["n_points"],
+        int | None,
+        typer.Option(
+            help="Points of the cloud after thinning, for --method paper also of a candidate; by default "
+            f"{_by_method('n_points')}."
+        ),
+    ] = None,
     generations: Annotated[
         int | None, typer.Option(help=f"Generations of the search; by default {_by_method('n_generations')}.")
     ] = None,

@@ -1,0 +1,93 @@
+"""How a leaf ends: in a point, bluntly, or before its model does; and what that does to its length."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import phytofit
+from phytofit.flags import sighting
+from phytofit.likelihood import CloudLikelihood
+from phytofit.tip import blunt_end
+
+SPECIES = phytofit.load_species()
+TAPERS_EVENLY = {"leaf_taper": 0.3, "leaf_length": 50.0, "leaf_width": 6.0, "leaf_angle": 50.0}
+CLEAR, DOUBTFUL = 5.0, 2.5  # nats
+
+
+def scene(seed, *, until=1.0, longer=1.0, noise_cm=0.3):
+    """A phytomer whose leaf narrows evenly, seen up to a share of its midrib; the likelihood, and the true state, but
+    that the leaf may be longer."""
+    made = phytofit.simulate(fixed=TAPERS_EVENLY, n_points=4000, noise_cm=noise_cm, seed=seed)
+    leaf = made.organs[1]
+    piece, _ = leaf.nearest(made.points)
+    points = made.points[(made.labels == 1) | (piece < until * len(leaf.segment_lengths))]
+    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    x = made.x.copy()
+    x[[3, 5]] *= longer  # the bend is a thirtieth of the leaf's
+    state = likelihood.start(x, made.pose, noise_cm)
+    theta = state.theta.copy()
+    theta[-2:] = np.log(float(made.organs[0].area) / float(leaf.area)), -6.0
+    return likelihood, likelihood.with_theta(state, theta)
+
+
+def gain(likelihood, state):
+    return blunt_end(likelihood, state, likelihood.evaluate(state).scores)
+
+
+def test_a_leaf_that_ends_in_a_point_does_not_end_bluntly():
+    gains = [gain(*scene(seed)) for seed in range(8)]
+    assert np.median(gains) < DOUBTFUL
+    assert max(gains) < 2.0 * CLEAR  # half a chi-squared number each: 5 is exceeded once in 1,300
+
+
+@pytest.mark.parametrize("until", [0.9, 0.8])
+def test_a_leaf_without_its_tip_ends_bluntly(until):
+    assert min(gain(*scene(seed, until=until)) for seed in range(4)) > CLEAR
+
+
+def test_the_end_alone_decides():
+    """Half of the leaf's first two thirds is missing, which tells nothing of its tip."""
+    likelihood, state = scene(1)
+    base = likelihood.model.organs(state.x)[1].row(0)
+    points = (likelihood.points - state.pose[:3, 3]) @ state.pose[:3, :3]
+    piece, _ = base.nearest(points)
+    side = np.einsum("ni,ni->n", points - base.axis[piece], base.frame[piece][:, :, 1])
+    left = likelihood.at(likelihood.points[(piece > 20) | (side > 0.0) | (np.hypot(points[:, 0], points[:, 1]) < 3.0)])
+    left.organ, left.seen = left.organ[: len(left.points)], left.seen[: len(left.points)]
+    assert gain(left, state) == pytest.approx(gain(likelihood, state), abs=0.5)
+
+
+def test_without_points_at_the_end_there_is_no_answer():
+    assert gain(*scene(1, until=0.7)) == 0.0
+
+
+def test_points_that_would_be_expected_beyond_the_last():
+    """As many as the area there has, of all that are the leaf's."""
+    likelihood, state = scene(2, longer=1.2, noise_cm=0.1)
+    seen = sighting(likelihood, state, likelihood.evaluate(state).scores)
+    leaf = likelihood.model.organs(state.x)[1].row(0)
+    area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
+    beyond = float(area[25:].sum() / area.sum())  # the last of thirty pieces, from 1 / 1.2 on
+    n = np.count_nonzero(1.0 - likelihood.evaluate(state).scores[:, -2] - state.share[0] > 0.5)
+    assert seen.end == pytest.approx(1.0 / 1.2, abs=0.05)  # the end of a curve, on one that goes on straighter
+    assert seen.short == pytest.approx(n * beyond, rel=0.5)
+
+
+def test_no_more_points_are_expected_beyond_the_end_of_a_whole_leaf():
+    likelihood, state = scene(2, noise_cm=0.1)
+    seen = sighting(likelihood, state, likelihood.evaluate(state).scores)
+    assert seen.end > 0.97
+    assert seen.short < CLEAR
+
+
+def test_where_points_end_early_the_lower_end_is_there():
+    made = phytofit.simulate(n_points=2500, noise_cm=0.3, seed=3)
+    result = phytofit.fit(made.points, "cm", threads=2)
+    assert not result.estimate.too_long
+    seen = replace(result.estimate.sighting, end=0.8, short=99.0)
+    other = replace(result, estimate=replace(result.estimate, sighting=seen, too_long=True))
+    before, after = (next(t for t in it.traits if t.name == "leaf_length") for it in (result, other))
+    whole = float(result.organs[1].segment_lengths.sum())
+    assert before.low - after.low == pytest.approx(0.2 * whole)
+    assert (after.value, after.high) == (before.value, before.high)
