@@ -19,6 +19,7 @@ from phytofit.distances import Reference, chamfer
 from phytofit.flags import Sighting, sighting
 from phytofit.hidden import Hidden
 from phytofit.holes import find_holes
+from phytofit.intervals import covariance_of_independent
 from phytofit.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, Evaluation, State
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
@@ -408,12 +409,15 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     likelihood, state, free, at = end.likelihood, end.state, end.free, end.at
     k = state.n_parameters
     covariance = np.zeros((len(free), len(free)))
-    inverse = pinvh(_curvature(end))
+    curvature = _curvature(end)
+    inverse = pinvh(curvature)
     left = max(
         dependence.n_independent - free.sum(), LEAST_LEFT * dependence.n_independent
     )  # a fit takes some errors up
-    variability = (dependence.variability + np.diag(likelihood.precision))[np.ix_(free, free)]
-    covariance[np.ix_(free, free)] = inverse @ variability @ inverse * dependence.n_independent / left
+    scores = at.scores[:, free]
+    shared = dependence.variability[np.ix_(free, free)] - scores.T @ scores  # by neighbours
+    alone = covariance_of_independent(curvature, scores, likelihood.precision[free])
+    covariance[np.ix_(free, free)] = (alone + inverse @ shared @ inverse) * dependence.n_independent / left
     covariance[np.ix_(free, free)] += _by_holes(end, inverse)
     seen = sighting(likelihood, state, at.scores)
     return Estimate(
