@@ -76,7 +76,8 @@ def covariance_of_independent(curvature: FloatArray, scores: FloatArray, precisi
     whiten = vectors[:, known] / np.sqrt(values[known])
     ratio, turn = np.linalg.eigh(whiten.T @ (scores.T @ scores + np.diag(precision)) @ whiten)
     axes = whiten @ turn
-    std = np.sqrt(np.sum((scores @ axes) ** 4, axis=0))
+    square = (scores @ axes) ** 2
+    std = np.sqrt(np.sum(square**2, axis=0))
     middle = np.where(ratio - 1.0 > CLEAR * std, ratio, 1.0)
     covariance: FloatArray = (axes * middle) @ axes.T
     return covariance
