@@ -2,15 +2,18 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import minimize_scalar
+from scipy.stats import norm
 
 import phytofit
 from phytofit.dependence import NONE, width_misfit
-from phytofit.intervals import propagated
+from phytofit.intervals import covariance_of_independent, propagated
 from phytofit.likelihood import CloudLikelihood
 
 ROUNDING = 1e-9
 DRAWN = 0.05  # relative; quantiles of a hundred thousand draws, and what is lost by looking along axes only
 FREE = np.full(3, np.inf)
+N_LINES = 1000  # of which 95 % are 950, 7 more or less
 
 
 def covariance(seed):
@@ -65,3 +68,62 @@ def test_width_is_as_the_model_has_it_or_it_is_not():
     waved[made.labels == 2, 1] *= 1.0 + 0.1 * np.sqrt(2.0) * np.sin(leaf[:, 0])  # the blade lies across y
     moved = likelihood.at(waved)
     assert width_misfit(moved, state, moved.evaluate(state).scores, NONE) == pytest.approx(0.1, abs=0.035)
+
+
+def scores_of(n, seed, steeper=1.0):
+    """Scores (n, 3) of n points of a right model, in units that differ, or `steeper` along one slanting axis; the
+    curvature (3, 3); and that of one point, root @ root.T."""
+    random = np.random.default_rng(seed)
+    root = np.array([1.0, 30.0, 0.1])[:, np.newaxis] * random.normal(size=(3, 3))
+    scores = random.normal(size=(n, 3)) * [1.0, 1.0, steeper] @ root.T
+    return scores, n * root @ root.T, root
+
+
+@pytest.mark.parametrize(("n", "seed"), [(20, 0), (20, 1), (5000, 2)])
+def test_of_a_right_model_the_covariance_is_the_inverse_curvature(n, seed):
+    """Also of few points, whose scores happen to vary less or more."""
+    scores, curvature, root = scores_of(n, seed)
+    found = covariance_of_independent(curvature, scores, np.zeros(3))
+    np.testing.assert_allclose(n * root.T @ found @ root, np.eye(3), atol=ROUNDING)
+
+
+def test_of_a_wrong_model_the_covariance_is_the_sandwich():
+    """Along one axis scores vary four times as much as they should."""
+    n = 20_000
+    scores, curvature, root = scores_of(n, 3, steeper=2.0)
+    found = covariance_of_independent(curvature, scores, np.zeros(3))
+    inverse = np.linalg.inv(curvature)
+    for one in (found, inverse @ scores.T @ scores @ inverse):
+        np.testing.assert_allclose(n * root.T @ one @ root, np.diag([1.0, 1.0, 4.0]), atol=0.15)
+
+
+def test_of_what_nothing_is_known_there_is_no_covariance():
+    scores, curvature, _ = scores_of(50, 4)
+    scores[:, 1], curvature[1], curvature[:, 1] = 0.0, 0.0, 0.0
+    found = covariance_of_independent(curvature, scores, np.zeros(3))
+    known = np.ix_([0, 2], [0, 2])
+    expected = np.zeros((3, 3))
+    expected[known] = np.linalg.inv(curvature[known])
+    np.testing.assert_allclose(found, expected, atol=ROUNDING)
+
+
+def test_the_end_of_a_blurred_line_is_within_its_interval_as_often_as_it_should():
+    """Few points tell where it ends, as of a leaf's tip: with the scores' outer product the interval is too short."""
+    random, n, length, step = np.random.default_rng(0), 40, 10.0, 1e-3
+    held = []
+    for _ in range(N_LINES):
+        z = random.uniform(0.0, length, n) + random.normal(size=n)
+
+        def log_p(end, z=z):
+            return np.log(norm.cdf(z) - norm.cdf(z - end)) - np.log(end)
+
+        end = minimize_scalar(lambda end: -log_p(end).sum(), bounds=(5.0, 20.0), method="bounded").x
+        low, middle, high = (log_p(end + by) for by in (-step, 0.0, step))
+        scores = (high - low)[:, np.newaxis] / (2.0 * step)
+        curvature = np.full((1, 1), -np.sum(low - 2.0 * middle + high) / step**2)
+        sandwich = np.sum(scores**2) / curvature[0, 0] ** 2
+        errors = np.sqrt([covariance_of_independent(curvature, scores, np.zeros(1))[0, 0], sandwich])
+        held.append(np.abs(end - length) < 1.96 * errors)
+    ours, outer = np.mean(held, axis=0)
+    assert ours == pytest.approx(0.95, abs=0.03)
+    assert outer < ours - 0.02

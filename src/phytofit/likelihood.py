@@ -184,6 +184,17 @@ class CloudLikelihood:
     def with_theta(self, state: State, theta: FloatArray) -> State:
         return State(theta, state.pose, state.center)
 
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which entries (k + 12,) of theta are not held fixed."""
+        return self.lower < self.upper
+
+    def gradient(self, state: State, at: Evaluation) -> FloatArray:
+        """Derivatives (k + 12,) of the error, where the state was evaluated."""
+        of_points = at.scores.sum(axis=0) if self.weights is None else self.weights @ at.scores
+        gradient: FloatArray = (state.theta - self.mean) * self.precision - of_points
+        return gradient
+
     def pose_of(self, state: State) -> FloatArray:
         """Pose (4, 4) from the model's frame to the cloud's."""
         turn = Rotation.from_rotvec(state.turn).as_matrix()

@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, pinvh
+from scipy.linalg import pinvh
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
 from phytofit.beginnings import along_points, lower_insertion, turned_blade
+from phytofit.covariance import covariance_of, misfit_of
 from phytofit.dependence import Dependence, score_dependence, width_misfit
 from phytofit.distances import Reference, chamfer
 from phytofit.flags import Sighting, sighting
@@ -37,7 +38,6 @@ HOPELESS = 0.3  # nats for each point, by which a start is behind after the firs
 COARSE_TOLERANCE = 1.0  # nats; it is refined with all points afterwards
 START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some cm off is drawn in
 CUT_SHARES = (0.85, 0.97)  # of the midrib, from which the search for a missing tip starts; the second of rich leaves
-LEAST_KNOWN = 1e-9  # information on an entry of theta, below which it is none: labels may leave no share to be told
 DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its twelve parameters gain six by chance, and cost more
@@ -48,8 +48,6 @@ RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is lik
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
 SAME_SHARE = 0.05
 LOWER_ROUNDS = 3
-LEAST_LEFT = 1.0 / 3.0  # of the residuals' degrees of freedom
-STEP = 0.02  # of a parameter's standard error, for differences of the gradient
 
 
 @dataclass(frozen=True)
@@ -187,11 +185,6 @@ class _End(NamedTuple):
         """Log probability of the points, each counted for those that it stands for."""
         weights = self.likelihood.weights
         return float(self.at.log_p.sum() if weights is None else weights @ self.at.log_p)
-
-    @property
-    def free(self) -> NDArray[np.bool_]:
-        """Which entries of theta were not held fixed."""
-        return self.likelihood.lower < self.likelihood.upper
 
 
 class _Chosen(NamedTuple):
@@ -389,13 +382,7 @@ def _terms(likelihood: CloudLikelihood, state: State) -> tuple[float, FloatArray
     """Error, gradient (k,), and Fisher information by the scores' outer product, with the prior's (k, k)."""
     at = likelihood.evaluate(state)
     weighted = at.scores if likelihood.weights is None else at.scores * likelihood.weights[:, np.newaxis]
-    return at.error, _gradient(likelihood, state, at), at.scores.T @ weighted + np.diag(likelihood.precision)
-
-
-def _gradient(likelihood: CloudLikelihood, state: State, at: Evaluation) -> FloatArray:
-    of_points = at.scores.sum(axis=0) if likelihood.weights is None else likelihood.weights @ at.scores
-    gradient: FloatArray = (state.theta - likelihood.mean) * likelihood.precision - of_points
-    return gradient
+    return at.error, likelihood.gradient(state, at), at.scores.T @ weighted + np.diag(likelihood.precision)
 
 
 def _evidence(end: _End, inflation: float) -> float:
@@ -403,7 +390,7 @@ def _evidence(end: _End, inflation: float) -> float:
 
     Points whose errors depend on each other count as `inflation` times fewer.
     """
-    likelihood, theta, free, at = end.likelihood, end.state.theta, end.free, end.at
+    likelihood, theta, free, at = end.likelihood, end.state.theta, end.likelihood.free, end.at
     precision = likelihood.precision[free]
     information = (at.scores.T @ at.scores)[np.ix_(free, free)] / inflation + np.diag(precision)
     surprise = 0.5 * np.sum((theta - likelihood.mean) ** 2 * likelihood.precision)
@@ -413,16 +400,9 @@ def _evidence(end: _End, inflation: float) -> float:
 
 def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: bool) -> Estimate:
     end, dependence = chosen.end, chosen.dependence
-    likelihood, state, free, at = end.likelihood, end.state, end.free, end.at
+    likelihood, state, at = end.likelihood, end.state, end.at
     k = state.n_parameters
-    covariance = np.zeros((len(free), len(free)))
-    inverse = _inverse(_curvature(end), _held_at_bounds(end)[free])
-    left = max(
-        dependence.n_independent - free.sum(), LEAST_LEFT * dependence.n_independent
-    )  # a fit takes some errors up
-    variability = (dependence.variability + np.diag(likelihood.precision))[np.ix_(free, free)]
-    covariance[np.ix_(free, free)] = inverse @ variability @ inverse * dependence.n_independent / left
-    covariance[np.ix_(free, free)] += _by_holes(end, inverse)
+    covariance, left = covariance_of(likelihood, state, at, dependence)
     seen = sighting(likelihood, state, at.scores)
     return Estimate(
         x=state.x.copy(),
@@ -437,7 +417,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         error=at.error,
         evidence=chosen.evidence,
         inflation=dependence.inflation,
-        misfit_cm=_misfit(dependence, state.noise),
+        misfit_cm=misfit_of(dependence, state.noise),
         width_misfit=width_misfit(likelihood, state, at.scores, dependence.leaf),
         correlated_cm=dependence.leaf.reach_cm,
         rival=chosen.rival,
@@ -447,68 +427,3 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         sighting=seen,
         dithered=dithered,
     )
-
-
-def _held_at_bounds(end: _End) -> NDArray[np.bool_]:
-    """Which entries of theta would be beyond their bounds, were there none; not angles, for which 0 is no end."""
-    theta, likelihood = end.state.theta, end.likelihood
-    gradient = _gradient(likelihood, end.state, end.at)
-    held = np.where(gradient > 0.0, theta <= likelihood.lower, theta >= likelihood.upper)
-    held[: end.state.n_parameters] &= np.array(likelihood.space.units) != "deg"
-    return held
-
-
-def _inverse(curvature: FloatArray, held: NDArray[np.bool_]) -> FloatArray:
-    """Of the curvature (m, m) with the entries `held` at their bounds: the others don't follow them."""
-    apart = np.where(held[:, np.newaxis] | held, np.diag(np.diag(curvature)), curvature)
-    inverse: FloatArray = pinvh(apart)
-    return inverse
-
-
-def _misfit(dependence: Dependence, noise: FloatArray) -> float:
-    """How far, cm, the blade's surface lies off the model's: by what errors of neighbours on it share beyond what those
-    on the stem do, for a sensor's are on both, and are in the covariance."""
-    shared = dependence.leaf.correlation * float(noise[1] ** 2 + noise[2] ** 2)
-    of_sensor = dependence.stem.correlation * float(noise[0] ** 2)
-    return float(np.sqrt(max(0.0, shared - of_sensor)))
-
-
-def _by_holes(end: _End, inverse: FloatArray) -> FloatArray:
-    """Covariance (m, m) of the free entries of theta, of which `inverse` is that of the curvature, as it is not known
-    where holes end: to a cell either way."""
-    likelihood, state, free = end.likelihood, end.state, end.free
-    if likelihood.hidden is None:
-        return np.zeros_like(inverse)
-    before = _gradient(likelihood, state, end.at)[free]
-    shifts = []
-    for other in (likelihood.hidden.smaller(), likelihood.hidden.larger()):
-        there = likelihood.hiding(other)
-        shifts.append(inverse @ (_gradient(there, state, there.evaluate(state))[free] - before))
-    both = np.array(shifts)
-    covariance: FloatArray = 0.5 * both.T @ both
-    return covariance
-
-
-def _curvature(end: _End) -> FloatArray:
-    """Second derivatives of the error by the free entries of theta, by differences of the gradient, 0 for those of
-    which nothing is known; the information where they are not positive definite."""
-    likelihood, state, at, free = end.likelihood, end.state, end.at, np.flatnonzero(end.free)
-    gradient = _gradient(likelihood, state, at)[free]
-    information = (at.scores.T @ at.scores + np.diag(likelihood.precision))[np.ix_(free, free)]
-    curvature = np.zeros_like(information)
-    for row, i in enumerate(free):
-        if information[row, row] < LEAST_KNOWN:
-            continue
-        step = STEP / np.sqrt(information[row, row])
-        theta = state.theta.copy()
-        theta[i] += step if theta[i] + step <= likelihood.upper[i] else -step
-        moved = likelihood.with_theta(state, theta)
-        change = _gradient(likelihood, moved, likelihood.evaluate(moved))[free] - gradient
-        curvature[row] = change / (theta[i] - state.theta[i])
-    curvature = 0.5 * (curvature + curvature.T)
-    try:
-        known = np.diag(information) >= LEAST_KNOWN
-        cho_factor(curvature[np.ix_(known, known)])
-    except LinAlgError:
-        return information
-    return curvature

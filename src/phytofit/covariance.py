@@ -1,0 +1,99 @@
+"""How far an estimate may be off: the covariance of its error, and the misfit of the blade that it knows nothing of."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, cho_factor, pinvh
+
+from phytofit.dependence import Dependence
+from phytofit.intervals import covariance_of_independent
+from phytofit.likelihood import CloudLikelihood, Evaluation, State
+
+__all__ = ["covariance_of", "misfit_of"]
+
+FloatArray = NDArray[np.float64]
+LEAST_KNOWN = 1e-9  # information on an entry of theta, below which it is none: labels may leave no share to be told
+LEAST_LEFT = 1.0 / 3.0  # of the residuals' degrees of freedom
+STEP = 0.02  # of a parameter's standard error, for differences of the gradient
+
+
+def covariance_of(
+    likelihood: CloudLikelihood, state: State, at: Evaluation, dependence: Dependence
+) -> tuple[FloatArray, float]:
+    """Covariance (k + 12, k + 12) of the error of the maximum of a posterior, and how many independent points are left
+    for it after the fit.
+
+    A sandwich: that of independent points, what neighbours share, and what is not known of holes.  An entry that its
+    bound holds (a length or a share, not an angle, for which 0 is no end) has an error of its own, which the others do
+    not follow.
+    """
+    free = likelihood.free
+    curvature = _curvature(likelihood, state, at)
+    held = _held(likelihood, state, at)[free]
+    curvature = np.where(held[:, np.newaxis] | held, np.diag(np.diag(curvature)), curvature)
+    inverse = pinvh(curvature)
+    left = max(
+        dependence.n_independent - free.sum(), LEAST_LEFT * dependence.n_independent
+    )  # a fit takes some errors up
+    scores = at.scores[:, free]
+    shared = dependence.variability[np.ix_(free, free)] - scores.T @ scores  # by neighbours
+    alone = covariance_of_independent(curvature, scores, likelihood.precision[free])
+    covariance = np.zeros((len(free), len(free)))
+    covariance[np.ix_(free, free)] = (alone + inverse @ shared @ inverse) * dependence.n_independent / left
+    covariance[np.ix_(free, free)] += _by_holes(likelihood, state, at, inverse)
+    return covariance, float(left)
+
+
+def misfit_of(dependence: Dependence, noise: FloatArray) -> float:
+    """How far, cm, the blade's surface lies off the model's: by what errors of neighbours on it share beyond what those
+    on the stem do, for a sensor's are on both, and are in the covariance.  ``noise`` (3,) as of a :class:`State`."""
+    shared = dependence.leaf.correlation * float(noise[1] ** 2 + noise[2] ** 2)
+    of_sensor = dependence.stem.correlation * float(noise[0] ** 2)
+    return float(np.sqrt(max(0.0, shared - of_sensor)))
+
+
+def _held(likelihood: CloudLikelihood, state: State, at: Evaluation) -> NDArray[np.bool_]:
+    """Which entries of theta would be beyond their bounds, were there none; of the model's parameters but angles."""
+    gradient = likelihood.gradient(state, at)
+    held = np.where(gradient > 0.0, state.theta <= likelihood.lower, state.theta >= likelihood.upper)
+    held[: state.n_parameters] &= np.array(likelihood.space.units) != "deg"
+    return held
+
+
+def _by_holes(likelihood: CloudLikelihood, state: State, at: Evaluation, inverse: FloatArray) -> FloatArray:
+    """Covariance (m, m) of the free entries of theta, of which `inverse` is that of the curvature, as it is not known
+    where holes end: to a cell either way."""
+    if likelihood.hidden is None:
+        return np.zeros_like(inverse)
+    before = likelihood.gradient(state, at)[likelihood.free]
+    shifts = []
+    for other in (likelihood.hidden.smaller(), likelihood.hidden.larger()):
+        there = likelihood.hiding(other)
+        shifts.append(inverse @ (there.gradient(state, there.evaluate(state))[likelihood.free] - before))
+    both = np.array(shifts)
+    covariance: FloatArray = 0.5 * both.T @ both
+    return covariance
+
+
+def _curvature(likelihood: CloudLikelihood, state: State, at: Evaluation) -> FloatArray:
+    """Second derivatives of the error by the free entries of theta, by differences of the gradient, 0 for those of
+    which nothing is known; the information where they are not positive definite."""
+    free = np.flatnonzero(likelihood.free)
+    gradient = likelihood.gradient(state, at)[free]
+    information = (at.scores.T @ at.scores + np.diag(likelihood.precision))[np.ix_(free, free)]
+    curvature = np.zeros_like(information)
+    for row, i in enumerate(free):
+        if information[row, row] < LEAST_KNOWN:
+            continue
+        step = STEP / np.sqrt(information[row, row])
+        theta = state.theta.copy()
+        theta[i] += step if theta[i] + step <= likelihood.upper[i] else -step
+        moved = likelihood.with_theta(state, theta)
+        change = likelihood.gradient(moved, likelihood.evaluate(moved))[free] - gradient
+        curvature[row] = change / (theta[i] - state.theta[i])
+    curvature = 0.5 * (curvature + curvature.T)
+    try:
+        known = np.diag(information) >= LEAST_KNOWN
+        cho_factor(curvature[np.ix_(known, known)])
+    except LinAlgError:
+        return information
+    return curvature

@@ -1,0 +1,73 @@
+"""Covariance of an estimate where a parameter lies at its bound, and the misfit of a blade."""
+
+import numpy as np
+import pytest
+
+import phytofit
+from phytofit.covariance import covariance_of, misfit_of
+from phytofit.dependence import NONE, Bell, Dependence, score_dependence
+from phytofit.likelihood import CloudLikelihood
+from phytofit.optimize import refine
+
+SPECIES = phytofit.load_species()
+NAMES = SPECIES.space.names
+NOISE = np.array([0.3, 0.4, 0.3])
+
+
+def dependence(stem, leaf):
+    return Dependence(np.eye(2), 1.0, 100.0, stem, leaf)
+
+
+def test_errors_that_stem_and_leaf_share_are_no_misfit_of_the_blade():
+    assert misfit_of(dependence(NONE, NONE), NOISE) == 0.0
+    assert misfit_of(dependence(NONE, Bell(0.36, 1.0)), NOISE) == pytest.approx(0.6 * 0.5)
+    sensor = Bell(0.9, 1.0)
+    assert misfit_of(dependence(sensor, sensor), np.array([0.5, 0.5, 0.0])) == 0.0
+    assert misfit_of(dependence(sensor, Bell(0.2, 1.0)), np.full(3, 0.2)) == 0.0  # not less than none
+    both = misfit_of(dependence(Bell(0.5, 1.0), Bell(0.5, 1.0)), NOISE)
+    assert both == pytest.approx(np.sqrt(0.5 * (0.25 - 0.09)))
+
+
+def at_rest(made, upper_taper):
+    """The full model at its maximum, with a bound of the taper; the blade is known to be wide, not how it narrows."""
+    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
+    likelihood.upper[NAMES.index("leaf_taper")] = upper_taper
+    state = likelihood.start(made.x, made.pose, 0.3)
+
+    def evaluate(theta):
+        at = likelihood.evaluate(likelihood.with_theta(state, theta))
+        information = at.scores.T @ at.scores + np.diag(likelihood.precision)
+        return at.error, likelihood.gradient(likelihood.with_theta(state, theta), at), information
+
+    theta = refine(evaluate, state.theta, lower=likelihood.lower, upper=likelihood.upper).theta
+    state = likelihood.with_theta(state, theta)
+    return likelihood, state, likelihood.evaluate(state)
+
+
+@pytest.fixture(scope="module")
+def made():
+    return phytofit.simulate(fixed={"leaf_taper": 3.0}, n_points=1500, noise_cm=0.3, seed=4)
+
+
+def test_others_do_not_follow_a_parameter_that_its_bound_holds(made):
+    """The same as of a model without it, but for its own entry: the oracle takes it out of the free ones."""
+    likelihood, state, at = at_rest(made, 2.0)
+    i = NAMES.index("leaf_taper")
+    assert state.theta[i] == 2.0
+    assert likelihood.gradient(state, at)[i] < 0.0
+    known = score_dependence(likelihood, state)
+    found, _ = covariance_of(likelihood, state, at, known)
+    others = np.arange(len(found)) != i
+    assert np.all(np.abs(found[i, others]) < 0.1 * np.sqrt(found[i, i] * np.diag(found)[others] + 1e-12))
+    assert found[i, i] > 0.0
+
+    likelihood.lower[i] = likelihood.upper[i]
+    without, _ = covariance_of(likelihood, state, at, known)
+    np.testing.assert_allclose(np.diag(found)[others], np.diag(without)[others], rtol=0.05)
+
+
+def test_a_parameter_within_its_bounds_is_followed(made):
+    likelihood, state, at = at_rest(made, 6.0)
+    i, j = NAMES.index("leaf_taper"), NAMES.index("leaf_length")
+    found, _ = covariance_of(likelihood, state, at, score_dependence(likelihood, state))
+    assert abs(found[i, j]) / np.sqrt(found[i, i] * found[j, j]) > 0.2
