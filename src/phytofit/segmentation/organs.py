@@ -17,11 +17,11 @@ IntArray = NDArray[np.intp]
 LOBE = 0.35  # of a leaf's length: a shorter end that parts from it away from the stem is a lobe of it
 SMALL_LOBE = 0.1  # of the length beyond what two ends share: so short an end is a lobe, whatever they share
 THIN = 0.3  # of the sections of what leaves share, the share that is the stem's alone for sure
-WHORL = 1.25  # times thicker than those, it is no longer stem
+WHORL = 1.25  # times thicker than those, it is no longer the stem alone
 FLAT = 0.4  # thin over wide of the sections: what leaves share with less is a blade, not a stem
 STICKS_OUT = 1.8  # stem radii from the axis, and beyond: a leaf's base
-OVER_SURFACE = 0.5  # what a way over the surface of a whorl counts, beside the gap from the straight way to the stem
-BASE = 7.5  # typical distances of neighbours, of a leaf where it comes out of the whorl, by which it is placed
+BASE = 7.5  # typical distances of neighbours, of a leaf where it comes out of the whorl, from which it goes on
+END = 3.0  # typical distances of neighbours, of a whorl next to the stem, where all its leaves begin
 SLICE = 2.5  # typical distances of neighbours, thickness of a section
 
 
@@ -164,22 +164,23 @@ def _axis(graph: PlantGraph, distance: FloatArray, stem: IntArray) -> tuple[Floa
     """The stem's axis and radius without the bases of leaves, and the distance beyond which it is a whorl of leaves.
 
     A stem is about as thick all along; where several leaves share what is thicker, they are rolled around each other.
+    Where it was last nearer, as a ratio, to its own thickness than to that of the whorl where the leaves part, and it
+    gets no thinner downwards, or is as thin as it is elsewhere, the stem ends.
     """
     thickness = max(SLICE * graph.spacing, 0.012 * float(distance.max()))
-    band = ((distance[stem] - distance[stem].min()) / thickness).astype(int)
-    bands = np.unique(band)
-    centers = np.array([np.median(graph.points[stem[band == b]], axis=0) for b in bands])
-    spread = np.array(
-        [
-            np.median(np.linalg.norm(graph.points[stem[band == b]] - c, axis=1))
-            for b, c in zip(bands, centers, strict=True)
-        ]
-    )
-    radius = max(float(np.quantile(spread, THIN)), 0.5 * graph.spacing)
-    thin = np.flatnonzero(spread <= WHORL * radius)
-    last = bands[thin[-1]] if len(thin) else bands[-1]
-    top = float(distance[stem].min() + (last + 1) * thickness)
     path = centerline(graph.points[stem], distance[stem], thickness)
+    gap, _, _ = along_path(graph.points[stem], path)
+    low, top = float(distance[stem].min()), float(distance[stem].max())
+    steps = low + thickness * (np.arange(max(1, np.ceil((top - low) / thickness))) + 0.5)
+    sections = [gap[np.abs(distance[stem] - step) <= thickness] for step in steps]
+    steps = steps[[len(section) > 0 for section in sections]]
+    spread = np.array([np.median(section) for section in sections if len(section)])
+    radius = max(float(np.quantile(spread, THIN)), 0.5 * graph.spacing)
+    end = int(np.flatnonzero(spread <= max(WHORL * radius, np.sqrt(radius * spread[-1])))[-1])
+    if end + 1 < len(steps):
+        while end > 0 and spread[end - 1] < spread[end] and spread[end] > WHORL * radius:
+            end -= 1
+        top = float(np.interp(max(WHORL * radius, spread[end]), spread[end : end + 2], steps[end : end + 2]))
     for _ in range(2):
         below = stem[distance[stem] <= top]
         gap, _, _ = along_path(graph.points[below], path)
@@ -235,18 +236,22 @@ def _share_whorl(
 ) -> None:
     """Share the nodes of a whorl out among its leaves, of which `leaves` has the nodes beyond it, by label.
 
-    Rolled around each other they touch all over, so which is next over the surface says little.  A leaf comes straight
-    from the stem's end (3,).
+    Rolled around each other they touch all over, so which is next over the surface says little.  A leaf goes straight
+    to the stem's end (3,), from all over its visible base, and all leaves reach it: ways over the surface are compared
+    by how much longer they are than those to the stem.
     """
     nodes = whorl[np.isin(labels[whorl], list(leaves))]
     if len(leaves) < 2 or len(nodes) == 0:
         return
+    at_end = distance[nodes] <= distance[nodes].min() + END * graph.spacing
     cost = np.empty((len(leaves), len(nodes)))
     for row, own in enumerate(leaves.values()):
-        first = graph.points[own[distance[own] <= distance[own].min() + BASE * graph.spacing]].mean(axis=0)
+        base = graph.points[own[distance[own] <= distance[own].min() + BASE * graph.spacing]]
+        gap = np.min([along_path(graph.points[nodes], np.array([place, end]))[0] for place in base], axis=0)
         part = np.concatenate([nodes, own])
         inside = csr_array(graph.weights[part][:, part])
         way = dijkstra(inside, directed=False, indices=np.arange(len(nodes), len(part)), min_only=True)[: len(nodes)]
-        cost[row] = along_path(graph.points[nodes], np.array([first, end]))[0] + OVER_SURFACE * way
+        to_end = way[at_end & np.isfinite(way)]
+        cost[row] = gap + way - (np.median(to_end) if len(to_end) else 0.0)
     reached = np.isfinite(cost).any(axis=0)
     labels[nodes[reached]] = np.array(list(leaves))[np.argmin(cost[:, reached], axis=0)]

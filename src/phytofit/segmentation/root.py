@@ -43,17 +43,17 @@ def find_root(graph: PlantGraph, up: FloatArray | None) -> int | None:
     if up is not None:
         height = graph.points @ up
         low, span = float(height.min()), max(float(np.ptp(height)), 1e-9)
-    best: tuple[float, int, FloatArray] | None = None
-    for end in ends:
-        likeness, path = _likeness(graph, end)
-        score = likeness - HEIGHT_WEIGHT * (height[end] - low) / span
-        if path is not None and (best is None or score > best[0]):
-            best = (score, end, path)
-    if best is None:
-        return None
-    beyond = int(np.argmax(graph.points @ (best[2][0] - best[2][-1])))  # where a leaf hides the very end
-    score = _likeness(graph, beyond)[0] - HEIGHT_WEIGHT * (height[beyond] - low) / span
-    return beyond if score > best[0] else best[1]
+    likeness = {end: _likeness(graph, end) for end in ends}
+    for path in [path for _, path in likeness.values() if path is not None]:
+        beyond = int(np.argmax(graph.points @ (path[0] - path[-1])))  # where a leaf hides the very end
+        if beyond not in likeness:
+            likeness[beyond] = _likeness(graph, beyond)
+    score = {
+        end: alike - HEIGHT_WEIGHT * (height[end] - low) / span
+        for end, (alike, path) in likeness.items()
+        if path is not None
+    }
+    return max(score, key=lambda end: score[end], default=None)
 
 
 def _ends(graph: PlantGraph) -> list[int]:
