@@ -19,6 +19,7 @@ import sys
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -180,30 +181,34 @@ def real(pool: ProcessPoolExecutor) -> None:
     print(f"hand measures within the interval: {held} of {sum(map(len, errors.values()))}")
     for name, values in errors.items():
         print(f"  {name:16} mean absolute error {np.mean(values):5.1f} {'deg' if name == 'leaf_angle' else '%'}")
-    print("\nThe authors' simulated clouds: fitted parameter (theirs); last, the trait leaf_angle (of their leaf)")
-    names = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width")
-    print(f"{'':18}" + "".join(f"{name:>20}" for name in (*names, "trait leaf_angle")))
+    print("\nThe authors' simulated clouds: fitted parameter (theirs); below, trait and interval (of their organs)")
+    print(f"{'':18}" + "".join(f"{name:>30}" for name in HAND))
     for path in paths:
         if "simulated" in path.parts:
             theirs = dict(row.split() for row in path.with_suffix(".txt").read_text().splitlines())
             parameters = results[path].parameters
-            cells = "".join(f"{parameters[n]:11.2f} ({float(theirs[n]):6.2f})" for n in names)
-            angles = [
-                next(t.value for t in traits if t.name == "leaf_angle")
-                for traits in (results[path].traits, phytofit.measure(authors_organs(theirs)))
-            ]
-            cells += f"{angles[0]:11.2f} ({angles[1]:6.2f})"
+            cells = "".join(f"{parameters[n]:21.2f} ({float(theirs[n]):6.2f})" for n in HAND)
             print(f"{path.parent.name}/{path.stem:6}{cells}  {'; '.join(results[path].flags)}")
+            true = {t.name: t.value for t in phytofit.measure(authors_organs(theirs))}
+            fitted = {t.name: t for t in results[path].traits}
+            cells = (f"{fitted[n].value:.2f} [{interval(fitted[n])}] ({true[n]:6.2f})" for n in HAND)
+            print(f"{'':18}" + "".join(f"{cell:>30}" for cell in cells))
 
 
 def authors_organs(theirs: dict[str, str]) -> tuple[phytofit.Organ, ...]:
     """Stem and leaf as the authors' generator grows them, up to where the leaf hangs down: the stem is twice its
-    internode, the leaf starts at its surface, and each piece bends by 1.5 degrees more than their parameter says."""
+    internode, the leaf starts at its surface, and each piece bends by 1.5 degrees more than their parameter says.  As
+    sections through their clouds without noise show, their leaf has its width up to a third of its length, is wider by
+    a fifth from there on, and narrows as Eq. (2) says; its last piece has no points."""
     value = {name: float(text) for name, text in theirs.items()}
     stem = value["stem_internode_len"]
     leaf = value["leaf_angle"], value["leaf_length"], value["leaf_width"], value["leaf_rotate_angle"] + 1.5
     x = np.array([value["stem_diameter"], stem, *leaf, stem, 1.0])
-    return tuple(organ.row(0) for organ in SPECIES.model.organs(x))
+    tube, strip = (organ.row(0) for organ in SPECIES.model.organs(x))
+    n = SPECIES.model.n_pieces
+    profile = SPECIES.model.width_profile(widest=np.array([1.0 / 3.0]))[0]
+    profile[np.arange(n + 1) > n // 3] *= 1.2
+    return tube, replace(strip, half_width=0.5 * value["leaf_width"] * profile).until((n - 1.0) / n)
 
 
 class Leaf(NamedTuple):

@@ -150,3 +150,16 @@ def test_mesh_tells_stem_from_leaf_by_colour(tmp_path):
     mesh(phytomer()).export(tmp_path / "model.ply")
     colors = np.unique(trimesh.load_mesh(tmp_path / "model.ply").visual.vertex_colors, axis=0)
     assert len(colors) == 2
+
+
+@pytest.mark.parametrize("share", [0.05, 0.25, 0.4, 0.77, 1.0])
+def test_a_part_of_an_organ_ends_where_it_should(share):
+    """A straight wedge: what is left of it is a trapezoid."""
+    axis = np.zeros((5, 3))
+    axis[:, 0] = [0.0, 1.0, 4.0, 6.0, 10.0]
+    wedge = Organ(LEAF, axis, frames_along(axis, np.array([0.0, 1.0, 0.0])), 1.0 - axis[:, 0] / 10.0)
+    part = wedge.until(share)
+    assert part.axis[-1] == pytest.approx([10.0 * share, 0.0, 0.0])
+    assert part.half_width[-1] == pytest.approx(1.0 - share)
+    assert float(part.area) == pytest.approx(10.0 * share * (2.0 - share))
+    assert len(part.frame) == len(part.axis) - 1 == len(part.half_width) - 1

@@ -32,7 +32,7 @@ def scene(seed, *, until=1.0, longer=1.0, noise_cm=0.3):
 
 
 def gain(likelihood, state):
-    return blunt_end(likelihood, state, likelihood.evaluate(state).scores)
+    return blunt_end(likelihood, state, likelihood.evaluate(state).scores).gain
 
 
 def test_a_leaf_that_ends_in_a_point_does_not_end_bluntly():
@@ -81,13 +81,63 @@ def test_no_more_points_are_expected_beyond_the_end_of_a_whole_leaf():
     assert seen.short < CLEAR
 
 
-def test_where_points_end_early_the_lower_end_is_there():
+@pytest.mark.parametrize("until", [0.8, 0.9, 1.0])
+def test_where_a_leaf_ends(until):
+    likelihood, state = scene(3, until=until)
+    end = blunt_end(likelihood, state, likelihood.evaluate(state).scores)
+    assert end.share == pytest.approx(until, abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def result():
     made = phytofit.simulate(n_points=2500, noise_cm=0.3, seed=3)
-    result = phytofit.fit(made.points, "cm", threads=2)
-    assert not result.estimate.too_long
-    seen = replace(result.estimate.sighting, end=0.8, short=99.0)
-    other = replace(result, estimate=replace(result.estimate, sighting=seen, too_long=True))
-    before, after = (next(t for t in it.traits if t.name == "leaf_length") for it in (result, other))
+    return phytofit.fit(made.points, "cm", threads=2)
+
+
+def trait(result, name):
+    return next(t for t in result.traits if t.name == name)
+
+
+def with_estimate(result, **changes):
+    sighting = replace(result.estimate.sighting, end=changes.pop("end", 1.0))
+    return replace(result, estimate=replace(result.estimate, sighting=sighting, **changes))
+
+
+def test_a_leaf_that_is_longer_than_its_points_is_cut_back(result):
+    """Length and area are those of what is left; where it lies, and its other traits, stay."""
+    whole = result.organs[1]
+    cut = with_estimate(result, ends_at=0.8)
+    organ = cut.organs[1]
+    assert organ.segment_lengths.sum() == pytest.approx(0.8 * whole.segment_lengths.sum())
+    gone = 0.2 * whole.segment_lengths.sum()
+    assert trait(result, "leaf_length").value - trait(cut, "leaf_length").value == pytest.approx(gone)
+    assert trait(cut, "leaf_area").value < trait(result, "leaf_area").value
+    for name in ("leaf_width", "leaf_angle", "stem_diameter"):
+        assert trait(cut, name).value == pytest.approx(trait(result, name).value)
+
+
+def test_of_a_blunt_leaf_the_lower_end_is_at_the_last_point(result):
+    blunt = with_estimate(result, blunt=True, end=0.9)
     whole = float(result.organs[1].segment_lengths.sum())
-    assert before.low - after.low == pytest.approx(0.2 * whole)
-    assert (after.value, after.high) == (before.value, before.high)
+    before, after = trait(result, "leaf_length"), trait(blunt, "leaf_length")
+    assert before.low - after.low == pytest.approx(0.1 * whole)
+    assert after.value == before.value
+
+
+def test_a_blunt_leaf_with_a_rich_shape_is_flagged_and_open_above():
+    """Sideways bent, twisted, a plateau of width that ends early, as a broken leaf: no taper to go on with."""
+    shape = {"leaf_side_bend": 30.0, "leaf_twist": 60.0, "leaf_bow": 20.0, "leaf_base_width": 0.5, "leaf_taper": 4.0}
+    made = phytofit.simulate(
+        fixed=shape | {"leaf_length": 60.0, "leaf_angle": 50.0}, n_points=5000, noise_cm=0.2, seed=7
+    )
+    piece, _ = made.organs[1].nearest(made.points)
+    points = made.points[(made.labels == 1) | (piece < 24)]
+    result = phytofit.fit(points, "cm", up=made.pose[:3, 2], threads=2)
+    assert len(result.x) > 7
+    length = trait(result, "leaf_length")
+    true = next(t.value for t in phytofit.measure(made.organs) if t.name == "leaf_length")
+    seen = true - 0.2 * float(made.organs[1].segment_lengths.sum())
+    assert length.high is None
+    assert length.low <= seen + 1.0
+    assert seen - 1.0 < length.value < true + 1.0
+    assert any("bluntly" in flag or "cut back" in flag for flag in result.flags)

@@ -103,7 +103,8 @@ class Fit:
 
     def _organs_of(self, x: FloatArray) -> tuple[Organ, ...]:
         own = (o.row(0) for o in self.species.model.organs(x))
-        return tuple(Organ(o.kind, o.axis * self.scale, o.frame, o.half_width * self.scale) for o in own)
+        stem, leaf = (Organ(o.kind, o.axis * self.scale, o.frame, o.half_width * self.scale) for o in own)
+        return stem, leaf if self.estimate is None else leaf.until(self.estimate.ends_at)
 
     @cached_property
     def traits(self) -> list[Trait]:
@@ -138,17 +139,18 @@ class Fit:
         return np.inf if self.relative else CHORD_CM
 
     def _not_seen(self, name: str) -> float:
-        """What of a trait belongs to a tip that was not seen, or where there are no points though the leaf's would be
-        expected: the interval's low end is without it."""
+        """What of a trait belongs to a tip that was not seen, or beyond the last point of a leaf that ends bluntly: the
+        interval's low end is without it."""
         assert self.estimate is not None
-        until_share = self.estimate.sighting.end if self.estimate.too_long else self.estimate.seen
-        if name not in OPEN_WITHOUT_TIP or until_share == 1.0:
+        made = self.estimate
+        seen = min(1.0, made.sighting.end / made.ends_at) if made.blunt else made.seen
+        if name not in OPEN_WITHOUT_TIP or seen == 1.0:
             return 0.0
         leaf = self._organs_of(self.x)[1]
         pieces = leaf.segment_lengths
         if name == "leaf_area":
             pieces = pieces * (leaf.half_width[1:] + leaf.half_width[:-1])
-        until = np.interp(until_share * len(pieces), np.arange(len(pieces) + 1), np.append(0.0, np.cumsum(pieces)))
+        until = np.interp(seen * len(pieces), np.arange(len(pieces) + 1), np.append(0.0, np.cumsum(pieces)))
         return float(pieces.sum() - until)
 
     def _ends(self) -> Ends:
@@ -419,7 +421,8 @@ def _remarked(result: Fit) -> Fit:
         outlier_share=float(made.share[2]),
         midrib_seen=made.seen,
         tip_seen=made.tip_seen,
-        too_long=made.too_long,
+        blunt=made.blunt,
+        ends_at=made.ends_at,
         scale=result.scale,
     )
     return replace(result, flags=(*result.flags, *flags))

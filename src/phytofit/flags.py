@@ -35,7 +35,8 @@ BOUNDED = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width", "stem_dia
 NEAR_BOUND = 1e-6
 TIP_DOUBTFUL = "whether the tip was seen can't be told: the leaf may be longer"
 BEYOND_TIP = "{:.0f} points near the leaf's tip are not explained: the leaf may go on there"
-TOO_LONG = "{:.0f} points would be expected in the last {:.0f} % of the leaf, where none is: it may end sooner"
+CUT_BACK = "the fitted leaf was cut back by {:.0f} % to where its points end: {:.0f} more would be expected beyond"
+BLUNT = "the leaf ends bluntly: if its tip was not seen, it is longer"
 TIP_NOT_SEEN = "the tip was not seen: the leaf's length follows from its taper, and may be longer"
 
 
@@ -171,18 +172,21 @@ def flags_of(
     outlier_share: float,
     midrib_seen: float,
     tip_seen: bool,
-    too_long: bool,
+    blunt: bool,
+    ends_at: float,
     scale: float = 1.0,
 ) -> Iterator[str]:
     """The remarks on a fit: parameters x (k,), noise (2,) or more on stem and leaf, share of outliers, share of the
-    midrib that was seen, whether its tip clearly was, and whether points end before it; `scale` input lengths make a
-    cm."""
+    midrib that was seen, whether its tip clearly was, whether it ends bluntly, share of the midrib at which it does;
+    `scale` input lengths make a cm."""
     if midrib_seen < 1.0:
         yield TIP_NOT_SEEN
+    elif blunt:
+        yield BLUNT
     elif not tip_seen:
         yield TIP_DOUBTFUL
-    if too_long:
-        yield TOO_LONG.format(seen.short, 100.0 * (1.0 - seen.end))
+    if ends_at < 1.0:
+        yield CUT_BACK.format(100.0 * (1.0 - ends_at), seen.short)
     if seen.beyond:
         yield BEYOND_TIP.format(seen.beyond)
     yield from _of_what_was_seen(seen)

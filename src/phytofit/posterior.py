@@ -57,7 +57,8 @@ class Estimate:
     ``x`` (k,) with ``covariance`` (k, k) of its error; ``pose`` (4, 4) from the model's frame to the cloud's;
     ``noise`` (3,) cm: on the stem, on the leaf, and what the leaf's thickness adds across it; ``share`` (3,) of stem,
     leaf and outliers; ``seen``: share of the midrib that was seen, 1 unless the tip is missing; ``tip_seen``: whether
-    it clearly is not; ``too_long``: whether the leaf's points clearly end before its tip; ``log_p`` (n,) of the points;
+    it clearly is not; ``blunt``: whether a leaf that is taken as whole ends as one without its tip; ``ends_at``: share
+    of the midrib at which the leaf ends, 1 unless its points clearly end before its tip; ``log_p`` (n,) of the points;
     ``evidence``: Laplace's approximation of the log probability of the cloud, up to a constant of the cloud;
     ``inflation``: how many times more the errors vary than those of independent points would; ``misfit_cm``: how far
     the blade's surface lies off the model's, as the errors that neighbours on it share say, and those on the stem do
@@ -74,7 +75,8 @@ class Estimate:
     share: FloatArray
     seen: float
     tip_seen: bool
-    too_long: bool
+    blunt: bool
+    ends_at: float
     log_p: FloatArray
     error: float
     evidence: float
@@ -194,6 +196,7 @@ class _Chosen(NamedTuple):
     evidence: float
     dependence: Dependence
     tip_doubtful: bool
+    blunt: bool
     rival: FloatArray | None
 
 
@@ -279,7 +282,10 @@ def _better(species: Species, cloud: _Cloud, best: _End, begun: Iterable[State])
 
 def _choice(found: Sequence[_End]) -> _Chosen:
     """Of models whole and with the tip missing, in turn, the one with the most evidence; a tip is missing only where
-    that makes the points clearly more probable."""
+    that makes the points clearly more probable.
+
+    Of a richer leaf the taper is estimated too, and says little of a tip that was not seen: it is taken as whole.
+    """
     dependence = score_dependence(found[-1].likelihood, found[-1].state)  # the richest: least misfit
     fits = [end.fit_of_points / dependence.inflation for end in found]
     gains = [0.0] * len(found)  # by a missing tip
@@ -287,17 +293,20 @@ def _choice(found: Sequence[_End]) -> _Chosen:
         gain = fits[whole + 1] - fits[whole]
         if gain > TIP_DOUBTFUL:  # if the leaf's end says so too, not only its shape elsewhere
             end = found[whole]
-            gain = min(gain, blunt_end(end.likelihood, end.state, end.at.scores) / dependence.inflation)
+            gain = min(gain, blunt_end(end.likelihood, end.state, end.at.scores).gain / dependence.inflation)
         gains[whole] = gains[whole + 1] = gain
     odds = [0.0, 0.0, RARE, RARE]
     evidence = [_evidence(end, dependence.inflation) + o for end, o in zip(found, odds, strict=False)]
     backed = [e if i % 2 == 0 or gains[i] > TIP_MISSING else -np.inf for i, e in enumerate(evidence)]
     best = int(np.argmax(backed))
-    if best < len(found) - 1:
-        dependence = score_dependence(found[best].likelihood, found[best].state, dependence)
     others = [i for i in range(len(found)) if i // 2 != best // 2 and backed[i] > backed[best] - ABOUT_AS_PROBABLE]
     rival = found[max(others, key=lambda i: backed[i])].state.x if others else None
-    return _Chosen(found[best], evidence[best], dependence, best % 2 == 0 and gains[best] > TIP_DOUBTFUL, rival)
+    blunt = best == len(odds) - 1
+    best -= blunt
+    if best < len(found) - 1:
+        dependence = score_dependence(found[best].likelihood, found[best].state, dependence)
+    doubtful = best % 2 == 0 and gains[best] > TIP_DOUBTFUL
+    return _Chosen(found[best], evidence[best], dependence, doubtful, blunt, rival)
 
 
 def _end(
@@ -404,6 +413,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     k = state.n_parameters
     covariance, left = covariance_of(likelihood, state, at, dependence)
     seen = sighting(likelihood, state, at.scores)
+    too_long = state.seen == 1.0 and seen.short > TIP_MISSING * dependence.inflation
     return Estimate(
         x=state.x.copy(),
         covariance=covariance[:k, :k],
@@ -411,8 +421,9 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         noise=state.noise,
         share=state.share,
         seen=state.seen,
-        tip_seen=state.seen == 1.0 and not chosen.tip_doubtful and not seen.beyond,
-        too_long=state.seen == 1.0 and seen.short > TIP_MISSING * dependence.inflation,
+        tip_seen=state.seen == 1.0 and not chosen.tip_doubtful and not seen.beyond and not too_long,
+        blunt=chosen.blunt,
+        ends_at=blunt_end(likelihood, state, at.scores).share if too_long else 1.0,
         log_p=at.log_p,
         error=at.error,
         evidence=chosen.evidence,

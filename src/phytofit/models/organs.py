@@ -54,6 +54,15 @@ class Organ:
         nearest_pieces(np.ascontiguousarray(points), self.axis[:-1], tangent, self.segment_lengths, piece, along)
         return piece, along
 
+    def until(self, share: float) -> "Organ":
+        """One organ from its base up to a share, more than 0, of its axis."""
+        before = np.append(0.0, np.cumsum(self.segment_lengths))
+        end = share * before[-1]
+        m = max(1, int(np.searchsorted(before, end)))  # nodes that stay
+        tip = self.axis[m - 1] + (end - before[m - 1]) * self.frame[m - 1, :, 0]
+        half_width = np.append(self.half_width[:m], np.interp(end, before, self.half_width))
+        return Organ(self.kind, np.vstack([self.axis[:m], tip]), self.frame[:m], half_width)
+
     @property
     def area(self) -> FloatArray:
         """Area (...) of the surface, cm²: one side of a leaf, the lateral surface of a stem."""

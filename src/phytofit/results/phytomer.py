@@ -106,6 +106,7 @@ def _how_it_ended(result: Fit) -> dict[str, Any]:
         "share": dict(zip(("stem", "leaf", "outliers"), made.share.tolist(), strict=True)),
         "midrib_seen": made.seen,
         "tip_seen": made.tip_seen,
+        "leaf_ends_at": made.ends_at,
         "correlated_cm": made.correlated_cm,
         "evidence": made.evidence,
         "variance_inflation": made.inflation,
