@@ -146,12 +146,11 @@ class Fit:
         seen = min(1.0, made.sighting.end / made.ends_at) if made.blunt else made.seen
         if name not in OPEN_WITHOUT_TIP or seen == 1.0:
             return 0.0
-        leaf = self._organs_of(self.x)[1]
-        pieces = leaf.segment_lengths
+        whole = self._organs_of(self.x)[1]
+        part = whole.until(seen)
         if name == "leaf_area":
-            pieces = pieces * (leaf.half_width[1:] + leaf.half_width[:-1])
-        until = np.interp(seen * len(pieces), np.arange(len(pieces) + 1), np.append(0.0, np.cumsum(pieces)))
-        return float(pieces.sum() - until)
+            return float(whole.area - part.area)
+        return float(whole.segment_lengths.sum() - part.segment_lengths.sum())
 
     def _ends(self) -> Ends:
         """How far the traits' intervals reach: by the errors of the parameters, by how far the blade's surface lies
