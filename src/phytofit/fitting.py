@@ -139,8 +139,7 @@ class Fit:
         return np.inf if self.relative else CHORD_CM
 
     def _not_seen(self, name: str) -> float:
-        """What of a trait belongs to a tip that was not seen, or beyond the last point of a leaf that ends bluntly: the
-        interval's low end is without it."""
+        """What of a trait is a tip's that was not seen, or beyond a blunt leaf's last point: its low end is without it."""
         assert self.estimate is not None
         made = self.estimate
         seen = min(1.0, made.sighting.end / made.ends_at) if made.blunt else made.seen
