@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 import phytofit
 from phytofit.traits import CHORD_CM
 
+N_POINTS = 5000
 VOXEL_CM = 0.25
 NEIGHBORS = 16
 STEM_MARGIN, STEM_SCATTER = 1.3, 4.0  # of the stem's radius, and of its points' scatter, within which points are its
@@ -33,7 +34,7 @@ def measure(points: np.ndarray, seed_point: np.ndarray | None = None) -> dict[st
     Raises NoPhytomerError where no stem is found.
     """
     cloud, seeds = phytofit.from_points(points, "cm"), None if seed_point is None else np.atleast_2d(seed_point)
-    found = phytofit.prepare(cloud, phytofit.load_species(), seed_points=seeds)
+    found = phytofit.prepare(cloud, phytofit.load_species(), n_points=N_POINTS, seed_points=seeds)
     start = found.starts[0]
     upright = (found.points - start.pose[:3, 3]) @ start.pose[:3, :3]
     rho = np.hypot(upright[:, 0], upright[:, 1])

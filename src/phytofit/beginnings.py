@@ -33,7 +33,7 @@ def turned_blade(species: Species, likelihood: CloudLikelihood, state: State, sc
     names = species.space.names
     if "leaf_twist" not in names:
         return
-    on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2] > 0.5
+    on_leaf = state.belongs(scores)[1] > 0.5
     place, across = across_leaf(likelihood, state)
     turn = np.zeros(2)
     spread = np.zeros((2, 2))
@@ -77,7 +77,7 @@ def along_points(species: Species, likelihood: CloudLikelihood, state: State, sc
     a leaf that bends sharply, or curls back, needs."""
     space, k = species.space, state.n_parameters
     pose = likelihood.pose_of(state)
-    points = ((likelihood.points - pose[:3, 3]) @ pose[:3, :3])[scores[:, -2] + state.share[0] < 0.5]
+    points = ((likelihood.points - pose[:3, 3]) @ pose[:3, :3])[state.belongs(scores)[0] < 0.5]
     line, from_tip = _line_of(points[:: max(1, len(points) // N_WALKED)], state)
     if not len(line):
         return

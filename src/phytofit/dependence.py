@@ -70,8 +70,7 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
     """
     scores = likelihood.evaluate(state).scores
     independent = scores.T @ scores
-    on_stem = scores[:, -2] + state.share[0]
-    outlier = scores[:, -1] + state.share[2]
+    on_stem, _, outlier = state.belongs(scores)
     noise = state.noise
     organs = move([o.row(0) for o in likelihood.model.organs(state.x)], likelihood.pose_of(state))
     frame, distance = _local(organs, likelihood.points, on_stem > 0.5)
@@ -146,7 +145,7 @@ def width_misfit(likelihood: CloudLikelihood, state: State, scores: FloatArray, 
     Points that are uniform across a strip vary by a third of its half width squared, and by the noise, which neighbours
     share as the `bell` says.
     """
-    on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2] > 0.5
+    on_leaf = state.belongs(scores)[1] > 0.5
     leaf = likelihood.model.organs(state.x)[1].row(0)
     lengths = leaf.segment_lengths
     place, across = across_leaf(likelihood, state)

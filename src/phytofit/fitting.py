@@ -101,10 +101,10 @@ class Fit:
         """Stem and leaf in the cloud's frame, cm."""
         return move(self._organs_of(self.x), self.pose)
 
-    def _organs_of(self, x: FloatArray) -> tuple[Organ, ...]:
+    def _organs_of(self, x: FloatArray, *, whole: bool = False) -> tuple[Organ, ...]:
         own = (o.row(0) for o in self.species.model.organs(x))
         stem, leaf = (Organ(o.kind, o.axis * self.scale, o.frame, o.half_width * self.scale) for o in own)
-        return stem, leaf if self.estimate is None else leaf.until(self.estimate.ends_at)
+        return stem, leaf if whole or self.estimate is None else leaf.until(self.estimate.ends_at)
 
     @cached_property
     def traits(self) -> list[Trait]:
@@ -139,7 +139,7 @@ class Fit:
         return np.inf if self.relative else CHORD_CM
 
     def _not_seen(self, name: str) -> float:
-        """What of a trait is a tip's that was not seen, or beyond a blunt leaf's last point: its low end is without it."""
+        """What of a trait is of an unseen tip, or beyond a blunt leaf's last point: its low end is without that."""
         assert self.estimate is not None
         made = self.estimate
         seen = min(1.0, made.sighting.end / made.ends_at) if made.blunt else made.seen
@@ -168,9 +168,9 @@ class Fit:
         by_width = np.where(wider, made.quantile * made.width_misfit * value, 0.0)
         return ends.with_error(by_width, by_width)
 
-    def _values(self, x: FloatArray, thicker: float = 0.0) -> FloatArray:
-        """Values (t,) of the traits, of a stem with a radius that is so much larger."""
-        stem, leaf = self._organs_of(x)
+    def _values(self, x: FloatArray, *, thicker: float = 0.0, whole: bool = False) -> FloatArray:
+        """Values (t,) of the traits, of a stem with a radius so much larger, of the leaf as it ends, or `whole`."""
+        stem, leaf = self._organs_of(x, whole=whole)
         stem = replace(stem, half_width=np.maximum(stem.half_width + thicker, 0.0))
         return np.array([trait.value for trait in measure((stem, leaf), chord_cm=self._chord_cm)])
 
@@ -430,7 +430,7 @@ def _beside_its_rival(result: Fit) -> Fit:
     """The result, with a flag if another model is about as probable and its traits lie beyond the intervals."""
     if result.estimate is None or result.estimate.rival is None:
         return result
-    other = dict(zip([t.name for t in result.traits], result._values(result.estimate.rival), strict=True))
+    other = dict(zip([t.name for t in result.traits], result._values(result.estimate.rival, whole=True), strict=True))
     differ = [
         f"{t.name} may be {other[t.name]:.3g} {t.unit}"
         for t in result.traits

@@ -68,8 +68,7 @@ class Sighting:
 
 def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Sighting:
     """What of the phytomer the cloud shows; scores (n, k) of the points as `state` gives them."""
-    on_stem = scores[:, -2] + state.share[0]
-    on_leaf = 1.0 - on_stem - (scores[:, -1] + state.share[2])
+    on_stem, on_leaf, _ = state.belongs(scores)
     pose = likelihood.pose_of(state)
     points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]  # in the model's frame
     leaf = likelihood.model.organs(state.x)[1].row(0)
@@ -127,7 +126,7 @@ def strip_of(leaf: Organ, points: FloatArray, n_strips: int) -> NDArray[np.intp]
 def _beyond_tip(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> int:
     """Number of points near the leaf's tip that are of no organ, 0 if there are not more than outliers would be there
     by chance: the leaf may go on there, where the model does not."""
-    outlier = scores[:, -1] + state.share[2]
+    outlier = state.belongs(scores)[2]
     leaf = move([likelihood.model.organs(state.x)[1].row(0)], likelihood.pose_of(state))[0]
     near = NEAR_TIP * leaf.segment_lengths.sum()
     there = likelihood.points[(outlier > 0.5) & (np.linalg.norm(likelihood.points - leaf.axis[-1], axis=1) < near)]
@@ -183,10 +182,10 @@ def flags_of(
         yield TIP_NOT_SEEN
     elif blunt:
         yield BLUNT
-    elif not tip_seen:
-        yield TIP_DOUBTFUL
     if ends_at < 1.0:
         yield CUT_BACK.format(100.0 * (1.0 - ends_at), seen.short)
+    elif midrib_seen == 1.0 and not blunt and not tip_seen:
+        yield TIP_DOUBTFUL
     if seen.beyond:
         yield BEYOND_TIP.format(seen.beyond)
     yield from _of_what_was_seen(seen)

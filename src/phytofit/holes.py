@@ -29,7 +29,7 @@ def find_holes(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     whose the points are.  It may leave a part of the leaf's breadth; a strip that lacks points all along is no hole,
     but a width that is not right yet.
     """
-    on_leaf = 1.0 - scores[:, -2] - state.share[0] - scores[:, -1] - state.share[2]
+    on_leaf = state.belongs(scores)[1]
     stem, leaf = move([organ.row(0) for organ in likelihood.model.organs(state.x)], likelihood.pose_of(state))
     points = likelihood.points[on_leaf > 0.5]
     half = 0.5 * (leaf.half_width[1:] + leaf.half_width[:-1])

@@ -76,6 +76,12 @@ class State:
         """(3,) cm: on the stem, on the leaf, and what its thickness adds to that across the blade."""
         return np.exp(self.theta[-5:-2])
 
+    def belongs(self, scores: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Probabilities (n,) of points to be of the stem, of the leaf, or outliers; scores (n, k + 12) as this state
+        gives them."""
+        on_stem, outlier = scores[:, -2] + self.share[0], scores[:, -1] + self.share[2]
+        return on_stem, 1.0 - on_stem - outlier, outlier
+
     @property
     def share(self) -> FloatArray:
         """(3,) of the points: stem, leaf, outliers."""

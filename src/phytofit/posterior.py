@@ -41,10 +41,12 @@ CUT_SHARES = (0.85, 0.97)  # of the midrib, from which the search for a missing 
 DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its twelve parameters gain six by chance, and cost more
-TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which another end must fit better: by chance 1 in 1,300, 1 in 80
+TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
+EXPECTED_BEYOND = 7.0  # points that should lie beyond the last: of a whole leaf 1 in 1,100 has as many
 CLEARLY_BETTER = 5.0  # nats, by which another beginning of a richer leaf must fit better
 ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
+RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
 SAME_SHARE = 0.05
 LOWER_ROUNDS = 3
@@ -301,7 +303,7 @@ def _choice(found: Sequence[_End]) -> _Chosen:
     best = int(np.argmax(backed))
     others = [i for i in range(len(found)) if i // 2 != best // 2 and backed[i] > backed[best] - ABOUT_AS_PROBABLE]
     rival = found[max(others, key=lambda i: backed[i])].state.x if others else None
-    blunt = best == len(odds) - 1
+    blunt = best == RICH_CUT
     best -= blunt
     if best < len(found) - 1:
         dependence = score_dependence(found[best].likelihood, found[best].state, dependence)
@@ -413,7 +415,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     k = state.n_parameters
     covariance, left = covariance_of(likelihood, state, at, dependence)
     seen = sighting(likelihood, state, at.scores)
-    too_long = state.seen == 1.0 and seen.short > TIP_MISSING * dependence.inflation
+    too_long = state.seen == 1.0 and seen.short > EXPECTED_BEYOND * dependence.inflation
     return Estimate(
         x=state.x.copy(),
         covariance=covariance[:k, :k],

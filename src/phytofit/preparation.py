@@ -49,7 +49,7 @@ def prepare(
     cloud: PointCloud,
     species: Species,
     *,
-    n_points: int = 5000,
+    n_points: int,
     up: FloatArray | None = None,
     with_outliers: bool = False,
     seed_points: FloatArray | None = None,

@@ -20,6 +20,7 @@ __all__ = ["LEAF", "STEM", "Organ", "SurfaceSampler", "frames_along", "mesh", "m
 FloatArray = NDArray[np.float64]
 STEM = "stem"
 LEAF = "leaf"
+ROUNDING = 1e-9  # of an organ's length: a part that ends so near a node ends there
 COLORS = {STEM: (146, 100, 53, 255), LEAF: (52, 140, 60, 255)}
 
 
@@ -58,7 +59,7 @@ class Organ:
         """One organ from its base up to a share, more than 0, of its axis."""
         before = np.append(0.0, np.cumsum(self.segment_lengths))
         end = share * before[-1]
-        m = max(1, int(np.searchsorted(before, end)))  # nodes that stay
+        m = max(1, int(np.searchsorted(before, (1.0 - ROUNDING) * end)))  # nodes that stay
         tip = self.axis[m - 1] + (end - before[m - 1]) * self.frame[m - 1, :, 0]
         half_width = np.append(self.half_width[:m], np.interp(end, before, self.half_width))
         return Organ(self.kind, np.vstack([self.axis[:m], tip]), self.frame[:m], half_width)
