@@ -35,6 +35,7 @@ STEM_CM = 36.0  # of the same
 IN_MESH_CM = 1.5  # points farther from the mesh are of what it lacks: the plant had a ninth, dry leaf
 N_POINTS, NOISE_CM = 60_000, 0.3
 CAMERAS_DEG = (-35.0, 0.0, 35.0)  # azimuths, of the view from one side
+N_COPIES = 24
 NEAR = 0.06  # of leaf length, within which a leaf counts as right
 
 
@@ -57,6 +58,7 @@ def turntable() -> None:
         f"{100 * np.mean(~there):.1f} % of the points, more than {IN_MESH_CM} cm off the mesh "
         f"(with them: stem {of_all.stem:.2f}, leaves {of_all.leaves:.2f})"
     )
+    print_copies(made.segmentation.cloud.points[there], of_point[there], found.true)
     counted = np.zeros((len(truth.leaves), len(made.segmentation.leaves)))
     for i, leaf in enumerate(truth.leaves):
         for j, other in enumerate(made.segmentation.leaves):
@@ -98,6 +100,31 @@ def turntable() -> None:
     print(
         f"the stem, {STEM_CM} cm by the same measure, is {longest:.1f} cm along edges, {straight:.1f} cm between its "
         f"two farthest points: it is {100 * (STEM_CM / longest - 1.0):.0f} % too long; less that, {near} are"
+    )
+
+
+def print_copies(points: np.ndarray, truth: np.ndarray, n_leaves: int) -> None:
+    """How well organs are told apart in copies of the plant's cloud (n, 3): shuffled, each point moved by 0.2 mm, 2 %
+    of them left out, all moved by 0.5 mm."""
+    scores = []
+    for number in range(N_COPIES):
+        random = np.random.default_rng(number)
+        order = random.permutation(len(points)) if number % 4 == 0 else np.arange(len(points))
+        if number % 4 == 2:
+            order = order[random.random(len(points)) > 0.02]
+        moved = points[order]
+        if number % 4 == 1:
+            moved = moved + random.normal(0.0, 0.02, moved.shape)
+        if number % 4 == 3:
+            moved = moved + random.normal(0.0, 0.05, 3)
+        found = phytofit.segment(phytofit.PointCloud(moved, name="copy"), up="z")
+        scores.append(score(found.labels, truth[order], 0.0))
+    hits = np.array([it.hits for it in scores])
+    stem, leaves = ([getattr(it, organ) for it in scores] for organ in ("stem", "leaves"))
+    print(
+        f"the same of {N_COPIES} copies, shuffled, moved by fractions of a millimetre, without 2 % of points: "
+        f"all {n_leaves} leaves over 0.5 in {np.sum(hits == n_leaves)}, at least {hits.min()}; IoU of the stem "
+        f"{min(stem):.2f} to {max(stem):.2f}, of the leaves {min(leaves):.2f} to {max(leaves):.2f}"
     )
 
 

@@ -87,6 +87,16 @@ def test_of_a_right_model_the_covariance_is_the_inverse_curvature(n, seed):
     np.testing.assert_allclose(n * root.T @ found @ root, np.eye(3), atol=ROUNDING)
 
 
+@pytest.mark.parametrize("n", [300, 2500])
+def test_of_many_parameters_chance_adds_little(n):
+    """Of 26 some axes stand out, since they are chosen by the scores: the mean variance is a few per cent too large."""
+    random = np.random.default_rng(n)
+    found = [covariance_of_independent(n * np.eye(26), random.normal(size=(n, 26)), np.zeros(26)) for _ in range(10)]
+    variance = n * np.mean([np.trace(one) / 26 for one in found])
+    assert 1.0 - ROUNDING <= variance < 1.08
+    assert all(np.linalg.eigvalsh(n * one)[0] > 1.0 - ROUNDING for one in found)
+
+
 def test_of_a_wrong_model_the_covariance_is_the_sandwich():
     """Along one axis scores vary four times as much as they should."""
     n = 20_000

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 __all__ = ["Ends", "covariance_of_independent", "propagated"]
 
 FloatArray = NDArray[np.float64]
-CLEAR = 3.0  # standard errors by which scores must vary more than the curvature has it: by chance 1 in 740
+CLEAR = 3.0  # standard errors by which scores must vary more than the curvature has it
 
 
 class Ends(NamedTuple):
@@ -64,7 +64,9 @@ def covariance_of_independent(curvature: FloatArray, scores: FloatArray, precisi
     the inverse curvature.  The sandwich with the scores' outer product as its middle (Huber, 1967) is also that of a
     wrong one, but a poor estimate where few points decide, as at a leaf's tip: at the maximum, those that would pull
     most have been followed most.  So the outer product counts only along those axes along which it clearly exceeds the
-    curvature: White's information matrix test (Econometrica 50, 1982), one principal axis after the other.
+    curvature: White's information matrix test (Econometrica 50, 1982), one principal axis after the other.  The axes
+    are those of the scores themselves, so that of many parameters some exceed it by chance; variances then come out a
+    few per cent too large.
 
     Parameters
     ----------
