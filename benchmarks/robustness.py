@@ -268,33 +268,34 @@ def field_points() -> np.ndarray:
     return phytofit.read_cloud(sorted((DATA / "field").glob("*.ply"))[0], "cm").points
 
 
-def field_length(job: tuple[str, int, np.ndarray]) -> tuple[float, float, float, bool, float]:
-    """Leaf length and its interval, whether its tip is said to be missing, and how far the sphere was from the tip."""
-    how, number, tip = job
-    points, away = field_points(), np.inf
+def field_length(job: tuple[str, int, np.ndarray]) -> tuple[float, float, float, bool, float, float]:
+    """Leaf length and its interval, whether its tip is said to be missing, and how far the sphere was from the leaf's
+    ends (2, 3), base and tip."""
+    how, number, ends = job
+    points, away = field_points(), np.full(2, np.inf)
     random = np.random.default_rng(number)
     if how == "noise":
         points = phytofit.add_noise(points, 0.5, random)
     elif how == "sphere":
         center = points[np.random.default_rng(number).integers(len(points))]
         points = points[phytofit.occlude(points, 6.0, random)]
-        away = float(np.linalg.norm(center - tip))
+        away = np.linalg.norm(center - ends, axis=1)
     result = phytofit.fit(points, "cm", random_start=True, seed=number, threads=1)
     length = next(t for t in result.traits if t.name == "leaf_length")
     high = np.inf if length.high is None else length.high
-    return length.value, length.low, high, not result.estimate.tip_seen, away
+    return length.value, length.low, high, not result.estimate.tip_seen, *away
 
 
 def field(pool: ProcessPoolExecutor) -> None:
     if not DATA.is_dir():
         sys.exit(f"{DATA} is absent: the field phytomer can't be measured")
     whole = phytofit.fit(field_points(), "cm")
-    tip = whole.organs[1].axis[-1]
+    ends = whole.organs[1].axis[[0, -1]]
     untouched = next(t.value for t in whole.traits if t.name == "leaf_length")
     print(f"\nThe paper's corrupted field phytomers (Fig. 7); leaf length of the untouched cloud {untouched:.2f} cm")
     for how in ("noise", "sphere"):
-        jobs = [(how, number, tip) for number in range(1, COPIES + 1)]
-        value, low, high, missing, away = np.array(list(progress(pool.map(field_length, jobs), COPIES))).T
+        jobs = [(how, number, ends) for number in range(1, COPIES + 1)]
+        value, low, high, missing, from_base, away = np.array(list(progress(pool.map(field_length, jobs), COPIES))).T
         kept = away > 3.0 + 1.0  # cm: the sphere's radius, and some: it took nothing of the tip
         off = np.abs(value - untouched)
         held = np.mean((low <= untouched) & (untouched <= high))
@@ -303,6 +304,11 @@ def field(pool: ProcessPoolExecutor) -> None:
             f"median {np.median(off[kept]):.2f} cm off, at most {off[kept].max():.2f}; "
             f"interval holds it for {100 * held:.0f} % of all; tip missing or doubtful: {missing.sum():.0f}"
         )
+        for i in np.flatnonzero(off > 1.0):
+            print(
+                f"    copy {i + 1}: {value[i] - untouched:+.2f} cm; its sphere's middle is {from_base[i]:.1f} cm from "
+                f"the leaf's base, {away[i]:.1f} cm from its tip"
+            )
 
 
 def main() -> None:
