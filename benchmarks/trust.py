@@ -198,8 +198,8 @@ def real(pool: ProcessPoolExecutor) -> None:
 def authors_organs(theirs: dict[str, str]) -> tuple[phytofit.Organ, ...]:
     """Stem and leaf as the authors' generator grows them, up to where the leaf hangs down: the stem is twice its
     internode, the leaf starts at its surface, and each piece bends by 1.5 degrees more than their parameter says.  As
-    sections through their clouds without noise show, their leaf has its width up to a third of its length, is wider by
-    a fifth from there on, and narrows as Eq. (2) says; its last piece has no points."""
+    the points of their clouds without noise lie, their leaf has its width up to a third of its length, is wider by a
+    fifth from there on, and narrows as Eq. (2) says; its last piece has no points."""
     value = {name: float(text) for name, text in theirs.items()}
     stem = value["stem_internode_len"]
     leaf = value["leaf_angle"], value["leaf_length"], value["leaf_width"], value["leaf_rotate_angle"] + 1.5
