@@ -355,7 +355,7 @@ def fit_likelihood(
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
 ) -> Fit:
-    """The most probable phytomer: a short cross-entropy search, then refinement of the likelihood of the cloud."""
+    """The most probable phytomer of a cloud, thinned to `n_points`: a short cross-entropy search, then refinement."""
     most_probable = estimate(
         species,
         found.points,
