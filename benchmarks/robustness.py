@@ -1,12 +1,12 @@
 """Where the default method stops working, and whether its flags say so first.
 
-    python benchmarks/robustness.py [field] [sweeps] [--phytomers 60] [--peers 3]
+    python benchmarks/robustness.py [field] [sweeps] [--phytomers 100] [--untouched 300] [--peers 3]
 
 field    the paper's two data sets (Fig. 7): a field phytomer with 0.5 cm noise added, or without the points in a
          sphere of 6 cm; 50 copies each, from random starting means: leaf length beside that of the untouched cloud
-sweeps   simulated phytomers made worse step by step: noise, holes, a missing tip, outliers, one viewpoint, few points,
-         leaves of others; errors, coverage of the 95 % intervals and flags, and the errors of the paper's method and of
-         model_free.py on some of the clouds; plotted in docs/images/robustness.png
+sweeps   simulated phytomers made worse step by step, others at each step: noise, holes, a missing tip, outliers, few
+         viewpoints, few points, leaves of others; errors, coverage of the 95 % intervals and flags, and the errors of
+         the paper's method and of model_free.py on some of the clouds; plotted in docs/images/robustness.png
 """
 
 import argparse
@@ -32,13 +32,14 @@ import phytofit
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "robustness.png"
 SPECIES = phytofit.load_species()
 TRAITS = ("leaf_length", "leaf_angle", "leaf_width", "stem_diameter")
-FIRST_SEED = 900_000
+FIRST_SEED, SEEDS = 900_000, 10_000  # of the untouched phytomers; how many a step has for its own
+HOLED = "leaf removed"
 COPIES = 50  # of the field phytomer, each way
 
 
 class Sweep(NamedTuple):
     """One way of making a cloud worse: its unit, its steps, those of them at which the method is said to work, and
-    points (n, 3) of a phytomer at a step."""
+    points (n, 3) of a phytomer at a step.  At step 0 it is untouched."""
 
     unit: str
     steps: tuple[float, ...]
@@ -128,26 +129,42 @@ def among_others(made: phytofit.SimulatedPhytomer, n_leaves: float, random: np.r
 
 NOISE, HOLES, TIPS = (0.1, 0.25, 0.5, 1.0, 1.5, 2.0), (0.0, 0.1, 0.2, 0.4, 0.6), (0.0, 0.05, 0.1, 0.2, 0.3)
 OUTLIERS, POINTS = (0.0, 0.1, 0.2, 0.3, 0.4), (300.0, 1000.0, 2500.0, 5000.0)
-VIEWS, OTHERS = (1.0, 2.0, 3.0, 6.0), (0.0, 1.0, 2.0, 4.0)
+VIEWS, OTHERS = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0), (1.0, 2.0, 4.0)
 SWEEPS = {
     "noise": Sweep("cm", NOISE, NOISE[:5], with_noise, noise_cm=0.0),
-    "leaf removed": Sweep("share", HOLES, HOLES[:3], with_holes),
+    HOLED: Sweep("share", HOLES, HOLES[:3], with_holes),
     "tip cut off": Sweep("share of the midrib", TIPS, TIPS, without_tip),
     "outliers": Sweep("share of the points", OUTLIERS, OUTLIERS, with_outliers),
     "views": Sweep("cameras around the plant", VIEWS, VIEWS[2:], from_cameras),
     "points": Sweep("number", POINTS, POINTS, fewer),
-    "leaves of others": Sweep("number, and a wall", OTHERS, OTHERS[:1], among_others, seeded=True),
+    "leaves of others": Sweep("number, and a wall", OTHERS, (), among_others, seeded=True),
 }
 
 
-def measured(job: tuple[str, float, int, bool]) -> Outcome:
-    name, step, number, with_peers = job
-    sweep = SWEEPS[name]
-    made = phytofit.simulate(SPECIES, n_points=sweep.n_points, noise_cm=sweep.noise_cm, seed=FIRST_SEED + number)
-    points = sweep.cloud(made, step, np.random.default_rng(number))
+class Job(NamedTuple):
+    """A phytomer of a step of a sweep; without either, untouched."""
+
+    sweep: str
+    step: float
+    number: int
+    with_peers: bool
+
+    @property
+    def seed(self) -> int:
+        """Other phytomers at each step."""
+        if self.step == 0.0:
+            return FIRST_SEED + self.number
+        at = [(name, step) for name, sweep in SWEEPS.items() for step in sweep.steps].index(self[:2])
+        return FIRST_SEED + (1 + at) * SEEDS + self.number
+
+
+def measured(job: Job) -> Outcome:
+    sweep = SWEEPS[job.sweep]
+    made = phytofit.simulate(SPECIES, n_points=sweep.n_points, noise_cm=sweep.noise_cm, seed=job.seed)
+    points = sweep.cloud(made, job.step, np.random.default_rng(job.seed))
     seed_point = made.organs[1].axis[12] if sweep.seeded else None
     true = {t.name: t.value for t in phytofit.measure(made.organs)}
-    peers = peer_errors(points, seed_point, true["leaf_length"]) if with_peers else (np.nan, np.nan)
+    peers = peer_errors(points, seed_point, true["leaf_length"]) if job.with_peers else (np.nan, np.nan)
     try:
         result = phytofit.fit(points, "cm", seed_point=seed_point, threads=1)
     except phytofit.PhytofitError as refused:
@@ -179,21 +196,25 @@ def peer_errors(points: np.ndarray, seed_point: np.ndarray | None, length: float
     return errors[0], errors[1]
 
 
-def sweeps(pool: ProcessPoolExecutor, phytomers: int, n_peers: int) -> None:
-    jobs = [
-        (name, step, i, i < n_peers) for name, sweep in SWEEPS.items() for step in sweep.steps for i in range(phytomers)
-    ]
+def sweeps(pool: ProcessPoolExecutor, phytomers: int, untouched: int, n_peers: int) -> None:
+    steps = [(name, step) for name, sweep in SWEEPS.items() for step in sweep.steps if step]
+    jobs = [Job(HOLED, 0.0, i, i < n_peers) for i in range(untouched)]
+    jobs += [Job(name, step, i, i < n_peers) for name, step in steps for i in range(phytomers)]
     outcomes = defaultdict(list)
     for job, outcome in zip(jobs, progress(pool.map(measured, jobs, chunksize=1), len(jobs)), strict=True):
         outcomes[job[:2]].append(outcome)
+    for name in SWEEPS:
+        outcomes[name, 0.0] = outcomes[HOLED, 0.0]
     print(
-        f"\n{phytomers} simulated phytomers a step: median absolute error (95th percentile) of those that were found;"
+        f"\n{phytomers} simulated phytomers a step, {untouched} that are untouched (step 0 of each sweep that has one):"
     )
-    print("coverage of the 95 % intervals: of each of the four traits, of all, of the unflagged; last, leaf length by")
     print(
-        "the paper's method and by the baseline without a model: median absolute error of those that found one, of the "
-        f"first {min(n_peers, phytomers)}"
+        "median absolute error (95th percentile) of those that were found; coverage of the 95 % intervals: of each of"
     )
+    print(
+        "the four traits, of all, of the unflagged; last, leaf length by the paper's method and by the baseline without"
+    )
+    print(f"a model: median absolute error of those that found one, of the first {min(n_peers, phytomers)}")
     figure = Figure(figsize=(17.0, 7.0), layout="constrained")
     axes = figure.subplots(2, 4).ravel()
     axes[-1].axis("off")
@@ -204,33 +225,33 @@ def sweeps(pool: ProcessPoolExecutor, phytomers: int, n_peers: int) -> None:
             + "".join(f"{trait:>18}" for trait in TRAITS)
             + "   covered: each      all  unflagged   flagged  refused    paper's  model-free"
         )
-        shown = []
-        for step in sweep.steps:
-            those = outcomes[name, step]
-            errors = np.abs([o.error for o in those if o.found]).reshape(-1, len(TRAITS))
-            covered = np.array([o.covered for o in those if o.found]).reshape(-1, len(TRAITS))
-            plain = np.array([o.covered for o in those if o.found and not o.flags]).reshape(-1, len(TRAITS))
-            flagged = np.mean([bool(o.flags) for o in those])
-            refused = sum(not o.found for o in those)
-            median, most = (np.quantile(errors, q, axis=0) if len(errors) else np.full(4, np.nan) for q in (0.5, 0.95))
-            cells = "".join(f"{a:9.2f} ({b:6.2f})" for a, b in zip(median, most, strict=True))
-            held = [100 * np.nanmean(c) if len(c) else np.nan for c in (covered, plain)]
-            each = " ".join(f"{share:3.0f}" for share in 100 * np.nanmean(covered, axis=0)) if len(covered) else ""
-            others = np.full(2, np.nan)
-            if n_peers:
-                others = np.nanmedian(np.abs([o.peers for o in those[:n_peers]]), axis=0)
-            print(
-                f"{step:8g}{cells}  {each:15}{held[0]:6.0f} %{held[1]:9.0f} %{100 * flagged:8.0f} %{refused:9}"
-                f"{others[0]:11.2f}{others[1]:12.2f}",
-                flush=True,
-            )
-            shown.append((median[0], held[0], 100 * flagged, *others))
+        shown = [print_step(step, outcomes[name, step], n_peers) for step in sweep.steps]
         print_where_it_works(sweep, [o for step in sweep.works for o in outcomes[name, step] if o.found])
         lines = draw(ax, name, sweep, np.array(shown))
     axes[-1].legend(lines, [line.get_label() for line in lines], fontsize=10, loc="center")
     PICTURE.parent.mkdir(exist_ok=True)
     figure.savefig(PICTURE, dpi=110)
     print(f"\nplotted: {PICTURE.relative_to(PICTURE.parents[2])}")
+
+
+def print_step(step: float, those: list[Outcome], n_peers: int) -> tuple[float, ...]:
+    """Median error of leaf length, how many intervals hold (%), how many are flagged (%), and the peers' errors."""
+    errors = np.abs([o.error for o in those if o.found]).reshape(-1, len(TRAITS))
+    covered = np.array([o.covered for o in those if o.found]).reshape(-1, len(TRAITS))
+    plain = np.array([o.covered for o in those if o.found and not o.flags]).reshape(-1, len(TRAITS))
+    flagged = np.mean([bool(o.flags) for o in those])
+    refused = sum(not o.found for o in those)
+    median, most = (np.quantile(errors, q, axis=0) if len(errors) else np.full(4, np.nan) for q in (0.5, 0.95))
+    cells = "".join(f"{a:9.2f} ({b:6.2f})" for a, b in zip(median, most, strict=True))
+    held = [100 * np.nanmean(c) if len(c) else np.nan for c in (covered, plain)]
+    each = " ".join(f"{share:3.0f}" for share in 100 * np.nanmean(covered, axis=0)) if len(covered) else ""
+    others = np.nanmedian(np.abs([o.peers for o in those[:n_peers]]), axis=0) if n_peers else np.full(2, np.nan)
+    print(
+        f"{step:8g}{cells}  {each:15}{held[0]:6.0f} %{held[1]:9.0f} %{100 * flagged:8.0f} %{refused:9}"
+        f"{others[0]:11.2f}{others[1]:12.2f}",
+        flush=True,
+    )
+    return median[0], held[0], 100 * flagged, *others
 
 
 def print_where_it_works(sweep: Sweep, outcomes: list[Outcome]) -> None:
@@ -314,12 +335,16 @@ def field(pool: ProcessPoolExecutor) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", default=[], help="field, sweeps; both by default")
-    parser.add_argument("--phytomers", type=int, default=60)
+    parser.add_argument("--phytomers", type=int, default=100, help="a step")
+    parser.add_argument("--untouched", type=int, default=300, help="step 0 of holes, tip and outliers")
     parser.add_argument(
         "--peers", type=int, default=3, help="phytomers a step that the other methods measure too: they take long"
     )
     arguments = parser.parse_args()
-    parts = {"field": field, "sweeps": lambda pool: sweeps(pool, arguments.phytomers, arguments.peers)}
+    parts = {
+        "field": field,
+        "sweeps": lambda pool: sweeps(pool, arguments.phytomers, arguments.untouched, arguments.peers),
+    }
     unknown = set(arguments.parts) - set(parts)
     if unknown:
         sys.exit(f"no part is called {', '.join(unknown)}; there are {', '.join(parts)}")

@@ -274,6 +274,6 @@ def moved_up(height):
 def test_robustness_benchmark_measures_each_step():
     robustness = load("robustness")
     for name, sweep in robustness.SWEEPS.items():
-        outcome = robustness.measured((name, sweep.steps[0], 0, True))
+        outcome = robustness.measured(robustness.Job(name, sweep.steps[0], 0, True))
         assert outcome.found, name
         assert np.all(np.isfinite(outcome.peers)), name
