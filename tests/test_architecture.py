@@ -24,8 +24,10 @@ LAYERS = [
     {"trials"},
     {"validation"},
     {"recipe"},
-    {"fitting", "simulation", "segmentation", "reconstruct"},
+    {"fitting", "simulation", "reconstruct"},
     {"preparation", "posterior"},
+    {"meant"},
+    {"segmentation"},
     {"covariance"},
     {"beginnings", "dependence", "holes", "tip"},
     {"flags"},
@@ -37,7 +39,7 @@ LAYERS = [
     {"formats"},
     {"cloud"},
     {"kernels"},
-    {"parameters"},
+    {"parameters", "parsing"},
     {"errors"},
 ]
 DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}

@@ -34,10 +34,28 @@ def test_only_the_leaf_that_is_meant_is_measured(crowded):
     made, points, on_leaf = crowded
     result = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
     assert length_of(result) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
-    assert any("not connected with a seed point" in note for note in result.notes)
+    assert any("not of a seed point's leaf" in note for note in result.notes)
     assert len(result.reference) < len(points) - 1000
     alone = phytofit.fit(made.points, "cm", up=made.pose[:3, 2], threads=2)
     assert length_of(result) == pytest.approx(length_of(alone), abs=LENGTH_CM)
+
+
+def test_a_leaf_that_touches_the_one_that_is_meant_is_left_out(crowded):
+    made, _, on_leaf = crowded
+    upright = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    turn = np.deg2rad(50.0)
+    about = np.array([[np.cos(turn), np.sin(turn), 0.0], [-np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    other = upright[made.labels == 2] @ about  # from the same place of the stem
+    gap = np.linalg.norm(other[:, np.newaxis] - upright[made.labels == 2][::4], axis=2).min(axis=1)
+    assert np.count_nonzero(gap < 0.5) > 20
+    points = np.concatenate([upright, other]) @ made.pose[:3, :3].T + made.pose[:3, 3]
+    result = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
+    left = {tuple(point) for point in result.reference.tolist()}
+    own, foreign = points[: len(upright)], points[len(upright) :]
+    far = other[:, 0] ** 2 + other[:, 1] ** 2 > 10.0**2
+    assert np.mean([tuple(p) in left for p in own.tolist()]) > 0.9
+    assert np.mean([tuple(p) in left for p in foreign[far].tolist()]) < 0.05
+    assert length_of(result) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
 
 
 def test_a_seed_point_of_a_whole_phytomer_changes_little(crowded):

@@ -21,9 +21,10 @@ from phytofit.models import STEM, Organ, move
 from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parameters import ParameterSpace
+from phytofit.parsing import parse_points, parse_up
 from phytofit.pose import StartPose
 from phytofit.posterior import DITHER_CM, Estimate, estimate
-from phytofit.preparation import Prepared, parse_points, parse_up, prepare
+from phytofit.preparation import Prepared, prepare
 from phytofit.species import Species, load_species
 from phytofit.traits import CHORD_CM, Trait, measure
 
@@ -212,7 +213,7 @@ def fit(
     species : name of a species that comes with phytofit, a TOML file, or a Species
     up : "x", "-x", .. "-z" or a vector, where the upward direction is known
     seed_point : (3,) or (k, 3) in the cloud's unit, on the leaf that is meant, where the cloud shows others as well:
-        beside the stem, what is not connected with it is left out; one for each piece of a leaf in pieces
+        beside the stem, what is not of its leaf is left out; one for each piece of a leaf in pieces
     method : "likelihood", the most probable phytomer, with intervals; or "paper", the cross-entropy search of Sodhi et
         al., IROS 2018, for the least distance between the clouds
     distance : what the paper's method minimises: hausdorff (its own), quantile, chamfer, labels
@@ -262,7 +263,8 @@ def fit(
     )
     means = [mean_at(start, species.leading(N_SEARCHED).space) for start in found.starts]
     if random_start:
-        means[0] = _random_mean(species.leading(N_SEARCHED).space, seed)
+        drawn = CrossEntropy(species.leading(N_SEARCHED).space, n_samples=2, elite_fraction=0.9, seed=seed)
+        means[0] = drawn.ask()[0]  # from the prior, within its bounds (Fig. 7d)
     one_thread = threadpool_limits(limits=1, user_api="blas")  # more would round sums in another order
     with one_thread, ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
         result = METHODS[method](found, species, means, seed=seed, executor=executor, progress=progress, **search)
@@ -480,12 +482,6 @@ def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
     if abs(surprise - surprise_of_twin) < PLAUSIBLE_LEAD:
         return replace(better, flags=(*better.flags, UP_UNKNOWN))
     return better
-
-
-def _random_mean(space: ParameterSpace, seed: int) -> FloatArray:
-    """A start drawn from the prior within its bounds (Fig. 7d)."""
-    drawn: FloatArray = CrossEntropy(space, n_samples=2, elite_fraction=0.9, seed=seed).ask()[0]
-    return drawn
 
 
 def mean_at(start: StartPose, space: ParameterSpace) -> FloatArray:

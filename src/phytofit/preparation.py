@@ -3,24 +3,16 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from numpy.typing import NDArray
 
 from phytofit.cloud import PointCloud, remove_outliers, size_cm, thin
-from phytofit.errors import SettingError
+from phytofit.meant import meant_points
 from phytofit.pose import StartPose, start_poses
 from phytofit.species import Species
 
-__all__ = ["AXES", "Prepared", "parse_points", "parse_up", "prepare"]
+__all__ = ["Prepared", "prepare"]
 
 FloatArray = NDArray[np.float64]
-AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
-STEM_MARGIN, STEM_MARGIN_CM = 1.3, 1.0  # of its radius, and more, around a stem within which points are the stem's
-LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
-LEAST_PIECE = 30  # points; fewer are no piece of anything, and are left to be told for outliers
-NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
 
 
@@ -60,8 +52,7 @@ def prepare(
     and then thins the cloud at random: one point a voxel would change how points are spread around a surface.
     The coordinates are rounded, so that a rotated copy of the cloud gives the same numbers.
 
-    seed_points : (k, 3) in the cloud's unit, on the leaf that is meant: beside the stem only points count that are
-        connected with one of them
+    seed_points : (k, 3) in the cloud's unit, on the leaf that is meant: beside the stem no other leaf's points count
     """
     clean = used = cloud.take(remove_outliers(cloud.points))
     if with_outliers:
@@ -69,9 +60,9 @@ def prepare(
     scale = size_cm(clean.points) / _expected_size(species) if cloud.unit == "none" else 1.0
     starts = start_poses(clean.points / scale, _largest_stem_radius(species), up=up)
     if seed_points is not None:
-        meant = cloud.take(np.flatnonzero(_meant(cloud.points / scale, starts[0], seed_points / scale)))
+        meant = cloud.take(np.flatnonzero(meant_points(cloud.points / scale, starts[0], seed_points / scale)))
         found = prepare(meant, species, n_points=n_points, up=up, with_outliers=with_outliers)
-        left_out = f"{len(cloud) - len(meant)} of {len(cloud)} points left out: not connected with a seed point"
+        left_out = f"{len(cloud) - len(meant)} of {len(cloud)} points left out: not of a seed point's leaf"
         return replace(found, notes=(left_out, *found.notes))
     home = starts[0].pose
     upright = np.round((used.points / scale - home[:3, 3]) @ home[:3, :3], CANONICAL_DECIMALS)
@@ -88,29 +79,6 @@ def prepare(
         scale=scale,
         notes=tuple(_what_was_left_out(len(cloud), len(used), len(kept))),
     )
-
-
-def _meant(points: FloatArray, start: StartPose, seed_points: FloatArray) -> NDArray[np.bool_]:
-    """Which points (n, 3), cm, are not of pieces beside the stem that the seed points (k, 3) are not connected with."""
-    upright = (points - start.pose[:3, 3]) @ start.pose[:3, :3]
-    margin = STEM_MARGIN * start.radius + STEM_MARGIN_CM
-    on_stem = np.hypot(upright[:, 0], upright[:, 1]) < margin
-    on_stem &= (upright[:, 2] > start.foot - margin) & (upright[:, 2] < start.top + margin)
-    beside = np.flatnonzero(~on_stem)
-    tree = cKDTree(points[beside])
-    gap, nearest = tree.query(seed_points)
-    if np.any(gap > NEAREST_CM):
-        raise SettingError(
-            f"seed_point: expected a point within {NEAREST_CM:g} cm of a leaf's, found none for "
-            f"{seed_points[np.argmax(gap)].round(2).tolist()} cm; the nearest is {gap.max():.1f} cm away"
-        )
-    typical = float(np.median(tree.query(points[beside], k=min(LINK_NEIGHBOR, len(beside)))[0][:, -1]))
-    links = tree.query_pairs(max(LINK * typical, LEAST_LINK_CM), output_type="ndarray")
-    graph = coo_array((np.ones(len(links), bool), links.T), shape=(len(beside), len(beside)))
-    piece = connected_components(graph, directed=False)[1]
-    small = np.bincount(piece)[piece] < LEAST_PIECE
-    on_stem[beside[small | np.isin(piece, piece[nearest])]] = True
-    return on_stem
 
 
 def _some(n: int, n_wanted: int) -> NDArray[np.intp]:
@@ -150,29 +118,3 @@ def _expected_size(species: Species) -> float:
     """Size, as :func:`size_cm` takes it, of the phytomer that the prior expects."""
     nodes = np.concatenate([o.axis[0] for o in species.model.organs(species.space.mean)])
     return size_cm(nodes)
-
-
-def parse_up(up: str | ArrayLike | None) -> FloatArray | None:
-    """A unit vector (3,) from ``"x" .. "-z"`` or three numbers; None stays None."""
-    if up is None:
-        return None
-    if isinstance(up, str):
-        if up not in AXES:
-            raise SettingError(f"up: expected one of {', '.join(AXES)}, got {up!r}")
-        return np.array(AXES[up], float)
-    vector = np.asarray(up, float)
-    if vector.shape != (3,) or not np.isfinite(vector).all() or not np.any(vector):
-        raise SettingError(f"up: expected three numbers that are not all zero, got {up!r}")
-    unit: FloatArray = vector / np.linalg.norm(vector)
-    return unit
-
-
-def parse_points(points: ArrayLike) -> FloatArray:
-    """(k, 3) of one or more points."""
-    try:
-        rows = np.atleast_2d(np.asarray(points, float))
-    except ValueError:
-        rows = np.empty((0, 0))
-    if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
-        raise SettingError(f"seed_point: expected three numbers, or several times three, got {points!r}")
-    return rows

@@ -10,7 +10,7 @@ from rich.console import Console
 from phytofit.cloud import PointCloud
 from phytofit.errors import PhytofitError
 from phytofit.formats import read_cloud
-from phytofit.preparation import AXES
+from phytofit.parsing import AXES
 from phytofit.species import species_names
 
 __all__ = [

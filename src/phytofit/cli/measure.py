@@ -35,7 +35,7 @@ from phytofit.errors import PhytofitError, SettingError
 from phytofit.fitting import METHODS, Fit, fit
 from phytofit.formats import read_cloud, write_cloud
 from phytofit.optimize import Generation
-from phytofit.preparation import parse_up
+from phytofit.parsing import parse_up
 from phytofit.recipe import defaults, recipe
 from phytofit.results import prepare_folder, result_names, save_fit, table_text, trait_table, write_text
 from phytofit.simulation import SimulatedPhytomer, simulate

@@ -26,8 +26,8 @@ from phytofit.cli.console import (
 )
 from phytofit.errors import PhytofitError
 from phytofit.fitting import fit
+from phytofit.parsing import parse_up
 from phytofit.pipeline import PLANT_CM, PlantRun, run
-from phytofit.preparation import parse_up
 from phytofit.recipe import defaults
 from phytofit.reconstruct import CAMERAS, Reconstruction, reconstruct
 from phytofit.results import (

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from phytofit.cloud import PointCloud
 from phytofit.errors import CloudError, NoStemError, SettingError
-from phytofit.preparation import parse_up
+from phytofit.parsing import parse_up
 from phytofit.segmentation.derive import SegmentedLeaf, derive_leaves
 from phytofit.segmentation.graph import PlantGraph, coarse, geodesics, plant_graph
 from phytofit.segmentation.ground import find_ground

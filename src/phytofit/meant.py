@@ -1,0 +1,83 @@
+"""Which points of a crowded cloud are of the phytomer that is meant: by seed points on its leaf."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from phytofit.cloud import from_points
+from phytofit.errors import CloudError, NoStemError, SettingError
+from phytofit.pose import StartPose
+from phytofit.segmentation import segment
+
+__all__ = ["meant_points"]
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+STEM_MARGIN, STEM_MARGIN_CM = 1.3, 1.0  # of its radius, and more, around a stem within which points may be the stem's
+LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
+LEAST_PIECE = 30  # points; fewer are no piece of anything, and are left to be told for outliers if they are near
+NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf, and a stray point one of what is meant
+N_NEAREST = 15  # points about a seed point, whose organ is the one that is meant
+STEM, NOBODY = 1, -1  # label; piece
+
+
+def meant_points(points: FloatArray, start: StartPose, seed_points: FloatArray) -> BoolArray:
+    """Which points (n, 3), cm, are of the stem or of a leaf on which seed points (k, 3) lie.
+
+    Beside the stem, pieces that no seed point is connected with are of others.  What touches the leaf is told from it
+    by taking it and the stem apart as a plant.
+
+    Raises SettingError where a seed point is far from all points beside the stem.
+    """
+    upright = (points - start.pose[:3, 3]) @ start.pose[:3, :3]
+    seeds = (seed_points - start.pose[:3, 3]) @ start.pose[:3, :3]
+    margin = STEM_MARGIN * start.radius + STEM_MARGIN_CM
+    near_stem = np.hypot(upright[:, 0], upright[:, 1]) < margin
+    near_stem &= (upright[:, 2] > start.foot - margin) & (upright[:, 2] < start.top + margin)
+    beside = np.flatnonzero(~near_stem)
+    tree = cKDTree(upright[beside])
+    gap, nearest = tree.query(seeds)
+    if np.any(gap > NEAREST_CM):
+        raise SettingError(
+            f"seed_point: expected a point within {NEAREST_CM:g} cm of a leaf's, found none for "
+            f"{seed_points[np.argmax(gap)].round(2).tolist()} cm; the nearest is {gap.max():.1f} cm away"
+        )
+    typical = float(np.median(tree.query(upright[beside], k=min(LINK_NEIGHBOR, len(beside)))[0][:, -1]))
+    link = max(LINK * typical, LEAST_LINK_CM)
+    piece = np.full(len(points), NOBODY)
+    piece[beside] = _pieces(tree, link)
+    own = np.unique(piece[beside[nearest]])
+    connected = np.flatnonzero(near_stem | np.isin(piece, own))
+    other = _of_other_leaves(upright[connected], seeds)
+    leaf = piece.copy()
+    leaf[connected[other > 0]] = piece.max() + other[other > 0]
+    leaf[near_stem] = NOBODY
+    of_others = (np.bincount(leaf + 1)[leaf + 1] >= LEAST_PIECE) & (leaf != NOBODY) & ~np.isin(leaf, own)
+    far = cKDTree(upright[near_stem | np.isin(leaf, own)]).query(upright)[0] > NEAREST_CM
+    meant: BoolArray = ~(of_others | far)
+    return meant
+
+
+def _pieces(tree: cKDTree, link: float) -> NDArray[np.int64]:
+    """Which piece, from 0, each point (n,) of the tree is of: points at most a link apart are connected."""
+    links = tree.query_pairs(link, output_type="ndarray")
+    graph = coo_array((np.ones(len(links), bool), links.T), shape=(tree.n, tree.n))
+    piece: NDArray[np.int64] = connected_components(graph, directed=False)[1].astype(np.int64)
+    return piece
+
+
+def _of_other_leaves(upright: FloatArray, seeds: FloatArray) -> NDArray[np.int64]:
+    """Of which other leaf, from 1, each point (n,) is, 0 of none, when stem and leaves are taken apart; seeds (k, 3)
+    lie on the one that is meant."""
+    none = np.zeros(len(upright), np.int64)
+    try:
+        labels = segment(from_points(upright, "cm"), up="z").labels
+    except (CloudError, NoStemError):
+        return none
+    about = cKDTree(upright).query(seeds, k=N_NEAREST)[1]
+    meant = [np.bincount(labels[those]).argmax() for those in about]
+    if min(meant) <= STEM:  # not told apart
+        return none
+    return np.where((labels > STEM) & ~np.isin(labels, meant), labels, none)
