@@ -3,7 +3,8 @@
     python benchmarks/robustness.py [field] [sweeps] [--phytomers 100] [--untouched 300] [--peers 3]
 
 field    the paper's two data sets (Fig. 7): a field phytomer with 0.5 cm noise added, or without the points in a
-         sphere of 6 cm; 50 copies each, from random starting means: leaf length beside that of the untouched cloud
+         sphere of 6 cm; and among pieces of another phytomer and a background, with seed points on the leaf that is
+         meant; 50 copies each, from random starting means: leaf length beside that of the untouched cloud
 sweeps   simulated phytomers made worse step by step, others at each step: noise, holes, a missing tip, outliers, few
          viewpoints, few points, leaves of others; errors, coverage of the 95 % intervals and flags, and the errors of
          the paper's method and of model_free.py on some of the clouds; plotted in docs/images/robustness.png
@@ -25,6 +26,8 @@ import model_free
 import numpy as np
 from accuracy import DATA, progress
 from matplotlib.figure import Figure
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from trust import covers
 
 import phytofit
@@ -35,6 +38,8 @@ TRAITS = ("leaf_length", "leaf_angle", "leaf_width", "stem_diameter")
 FIRST_SEED, SEEDS = 900_000, 10_000  # of the untouched phytomers; how many a step has for its own
 HOLED = "leaf removed"
 COPIES = 50  # of the field phytomer, each way
+SEEDED = (6, 12, 18, 24)  # nodes of its midrib that are seed points
+N_PIECES, PIECE_CM = 6, 6.0  # of another phytomer; their radius
 
 
 class Sweep(NamedTuple):
@@ -285,38 +290,57 @@ def draw(ax, name: str, sweep: Sweep, shown: np.ndarray) -> list:  # type: ignor
     return [*ax.get_lines(), *other.get_lines()]
 
 
-def field_points() -> np.ndarray:
-    return phytofit.read_cloud(sorted((DATA / "field").glob("*.ply"))[0], "cm").points
+def field_points(number: int = 0) -> np.ndarray:
+    return phytofit.read_cloud(sorted((DATA / "field").glob("*.ply"))[number], "cm").points
 
 
-def field_length(job: tuple[str, int, np.ndarray]) -> tuple[float, float, float, bool, float, float]:
-    """Leaf length and its interval, whether its tip is said to be missing, and how far the sphere was from the leaf's
-    ends (2, 3), base and tip."""
-    how, number, ends = job
-    points, away = field_points(), np.full(2, np.inf)
+def among_pieces(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """With pieces of another field phytomer, turned at random, 5 to 20 cm from points of this one, and a background."""
+    other, parts = field_points(1), [points]
+    for _ in range(N_PIECES):
+        piece = other[np.linalg.norm(other - random.choice(other), axis=1) < PIECE_CM]
+        toward = random.normal(size=3)
+        place = random.choice(points) + random.uniform(5.0, 20.0) * toward / np.linalg.norm(toward)
+        parts.append((piece - piece.mean(axis=0)) @ Rotation.random(random_state=random).as_matrix() + place)
+    low, high = points.min(axis=0), points.max(axis=0)
+    thin = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]  # the view's direction, about
+    sheet = random.uniform(low - 10.0, high + 10.0, (len(points) // 2, 3))
+    sheet -= ((sheet - points.mean(axis=0)) @ thin - 20.0 - random.normal(0.0, 0.5, len(sheet)))[:, np.newaxis] * thin
+    return np.concatenate([*parts, sheet])
+
+
+def field_length(job: tuple[str, int, np.ndarray]) -> tuple[float, float, float, bool, bool, float, float]:
+    """Leaf length and its interval, whether its tip is said to be missing, whether it has a flag, and how far the
+    sphere was from the leaf's ends, base and tip, or the next piece of another; midrib (k, 3) of the untouched leaf."""
+    how, number, midrib = job
+    points, away, seed_point = field_points(), np.full(2, np.inf), None
     random = np.random.default_rng(number)
     if how == "noise":
         points = phytofit.add_noise(points, 0.5, random)
     elif how == "sphere":
         center = points[np.random.default_rng(number).integers(len(points))]
         points = points[phytofit.occlude(points, 6.0, random)]
-        away = np.linalg.norm(center - ends, axis=1)
-    result = phytofit.fit(points, "cm", random_start=True, seed=number, threads=1)
+        away = np.linalg.norm(center - midrib[[0, -1]], axis=1)
+    elif how == "pieces":
+        crowded, seed_point = among_pieces(points, random), midrib[list(SEEDED)]  # it has gaps: one for each piece
+        away[0] = cKDTree(points).query(crowded[len(points) :])[0].min()
+        points = crowded
+    result = phytofit.fit(points, "cm", random_start=True, seed=number, threads=1, seed_point=seed_point)
     length = next(t for t in result.traits if t.name == "leaf_length")
     high = np.inf if length.high is None else length.high
-    return length.value, length.low, high, not result.estimate.tip_seen, *away
+    return length.value, length.low, high, not result.estimate.tip_seen, bool(result.flags), *away
 
 
 def field(pool: ProcessPoolExecutor) -> None:
     if not DATA.is_dir():
         sys.exit(f"{DATA} is absent: the field phytomer can't be measured")
     whole = phytofit.fit(field_points(), "cm")
-    ends = whole.organs[1].axis[[0, -1]]
     untouched = next(t.value for t in whole.traits if t.name == "leaf_length")
     print(f"\nThe paper's corrupted field phytomers (Fig. 7); leaf length of the untouched cloud {untouched:.2f} cm")
-    for how in ("noise", "sphere"):
-        jobs = [(how, number, ends) for number in range(1, COPIES + 1)]
-        value, low, high, missing, from_base, away = np.array(list(progress(pool.map(field_length, jobs), COPIES))).T
+    for how in ("noise", "sphere", "pieces"):
+        jobs = [(how, number, whole.organs[1].axis) for number in range(1, COPIES + 1)]
+        measured = np.array(list(progress(pool.map(field_length, jobs), COPIES))).T
+        value, low, high, missing, flagged, near, away = measured
         kept = away > 3.0 + 1.0  # cm: the sphere's radius, and some: it took nothing of the tip
         off = np.abs(value - untouched)
         held = np.mean((low <= untouched) & (untouched <= high))
@@ -326,10 +350,12 @@ def field(pool: ProcessPoolExecutor) -> None:
             f"interval holds it for {100 * held:.0f} % of all; tip missing or doubtful: {missing.sum():.0f}"
         )
         for i in np.flatnonzero(off > 1.0):
-            print(
-                f"    copy {i + 1}: {value[i] - untouched:+.2f} cm; its sphere's middle is {from_base[i]:.1f} cm from "
-                f"the leaf's base, {away[i]:.1f} cm from its tip"
-            )
+            at = {
+                "noise": "",
+                "sphere": f"; its sphere's middle is {near[i]:.1f} cm from the leaf's base, {away[i]:.1f} cm from its tip",
+                "pieces": f"; the next piece is {near[i]:.1f} cm away",
+            }
+            print(f"    copy {i + 1}: {value[i] - untouched:+.2f} cm{', flagged' if flagged[i] else ''}{at[how]}")
 
 
 def main() -> None:

@@ -1,5 +1,7 @@
 """Which points of a crowded cloud are of the phytomer that is meant: by seed points on its leaf."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -7,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from phytofit.cloud import from_points
-from phytofit.errors import CloudError, NoStemError, SettingError
+from phytofit.errors import CloudError, NoPhytomerError, NoStemError, SettingError
 from phytofit.pose import StartPose
 from phytofit.segmentation import segment
 
@@ -19,18 +21,30 @@ STEM_MARGIN, STEM_MARGIN_CM = 1.3, 1.0  # of its radius, and more, around a stem
 LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
 LEAST_PIECE = 30  # points; fewer are no piece of anything, and are left to be told for outliers if they are near
 NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf, and a stray point one of what is meant
+N_AROUND = 300  # points about a seed point, by which it is told how dense the leaf's are
 N_NEAREST = 15  # points about a seed point, whose organ is the one that is meant
 STEM, NOBODY = 1, -1  # label; piece
 
 
-def meant_points(points: FloatArray, start: StartPose, seed_points: FloatArray) -> BoolArray:
+def meant_points(
+    points: FloatArray, seed_points: FloatArray, find_starts: Callable[[FloatArray], list[StartPose]]
+) -> BoolArray:
     """Which points (n, 3), cm, are of the stem or of a leaf on which seed points (k, 3) lie.
 
-    Beside the stem, pieces that no seed point is connected with are of others.  What touches the leaf is told from it
-    by taking it and the stem apart as a plant.
+    The stem is looked for, with `find_starts`, among the points that are connected with a seed point, or among all if
+    it isn't there.  Beside it, pieces that no seed point is connected with are of others.  What touches the leaf is
+    told from it by taking it and the stem apart as a plant.
 
-    Raises SettingError where a seed point is far from all points beside the stem.
+    Raises SettingError where a seed point is far from all points beside the stem, and what `find_starts` does.
     """
+    tree = cKDTree(points)
+    link = _link(tree, tree.query(seed_points, k=min(N_AROUND, len(points)))[1].ravel())
+    piece = _pieces(tree, link)
+    seeded = np.isin(piece, piece[tree.query(seed_points)[1]])
+    try:
+        start = find_starts(points[seeded])[0]
+    except NoPhytomerError:
+        start = find_starts(points)[0]
     upright = (points - start.pose[:3, 3]) @ start.pose[:3, :3]
     seeds = (seed_points - start.pose[:3, 3]) @ start.pose[:3, :3]
     margin = STEM_MARGIN * start.radius + STEM_MARGIN_CM
@@ -44,8 +58,6 @@ def meant_points(points: FloatArray, start: StartPose, seed_points: FloatArray) 
             f"seed_point: expected a point within {NEAREST_CM:g} cm of a leaf's, found none for "
             f"{seed_points[np.argmax(gap)].round(2).tolist()} cm; the nearest is {gap.max():.1f} cm away"
         )
-    typical = float(np.median(tree.query(upright[beside], k=min(LINK_NEIGHBOR, len(beside)))[0][:, -1]))
-    link = max(LINK * typical, LEAST_LINK_CM)
     piece = np.full(len(points), NOBODY)
     piece[beside] = _pieces(tree, link)
     own = np.unique(piece[beside[nearest]])
@@ -58,6 +70,12 @@ def meant_points(points: FloatArray, start: StartPose, seed_points: FloatArray) 
     far = cKDTree(upright[near_stem | np.isin(leaf, own)]).query(upright)[0] > NEAREST_CM
     meant: BoolArray = ~(of_others | far)
     return meant
+
+
+def _link(tree: cKDTree, about: NDArray[np.intp]) -> float:
+    """Distance, cm, within which points are connected: by how dense the cloud is about some of them."""
+    gap = tree.query(tree.data[about], k=min(LINK_NEIGHBOR, tree.n))[0][:, -1]
+    return max(LINK * float(np.median(gap)), LEAST_LINK_CM)
 
 
 def _pieces(tree: cKDTree, link: float) -> NDArray[np.int64]:

@@ -1,6 +1,7 @@
 """Before a fit: the cloud is cleaned, its stem found, and what is left thinned as it looks from there."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,12 +59,13 @@ def prepare(
     if with_outliers:
         used = cloud
     scale = size_cm(clean.points) / _expected_size(species) if cloud.unit == "none" else 1.0
-    starts = start_poses(clean.points / scale, _largest_stem_radius(species), up=up)
+    find_starts = partial(start_poses, stem_radius=_largest_stem_radius(species), up=up)
     if seed_points is not None:
-        meant = cloud.take(np.flatnonzero(meant_points(cloud.points / scale, starts[0], seed_points / scale)))
+        meant = cloud.take(np.flatnonzero(meant_points(cloud.points / scale, seed_points / scale, find_starts)))
         found = prepare(meant, species, n_points=n_points, up=up, with_outliers=with_outliers)
         left_out = f"{len(cloud) - len(meant)} of {len(cloud)} points left out: not of a seed point's leaf"
         return replace(found, notes=(left_out, *found.notes))
+    starts = find_starts(clean.points / scale)
     home = starts[0].pose
     upright = np.round((used.points / scale - home[:3, 3]) @ home[:3, :3], CANONICAL_DECIMALS)
     kept = _some(len(upright), n_points) if with_outliers else thin(upright, n_points)
