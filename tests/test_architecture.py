@@ -29,7 +29,7 @@ LAYERS = [
     {"meant"},
     {"segmentation"},
     {"covariance"},
-    {"beginnings", "dependence", "holes", "tip"},
+    {"beginnings", "dependence", "holes", "tip", "whole_pieces"},
     {"flags"},
     {"likelihood", "objectives", "pose"},
     {"distances", "hidden"},

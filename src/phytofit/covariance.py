@@ -8,7 +8,7 @@ from phytofit.dependence import Dependence
 from phytofit.intervals import covariance_of_independent
 from phytofit.likelihood import CloudLikelihood, Evaluation, State
 
-__all__ = ["covariance_of", "misfit_of"]
+__all__ = ["covariance_of", "grown", "misfit_of"]
 
 FloatArray = NDArray[np.float64]
 LEAST_KNOWN = 1e-9  # information on an entry of theta, below which it is none: labels may leave no share to be told
@@ -17,14 +17,19 @@ STEP = 0.02  # of a parameter's standard error, for differences of the gradient
 
 
 def covariance_of(
-    likelihood: CloudLikelihood, state: State, at: Evaluation, dependence: Dependence
+    likelihood: CloudLikelihood,
+    state: State,
+    at: Evaluation,
+    dependence: Dependence,
+    *,
+    holes_end_elsewhere: bool = True,
 ) -> tuple[FloatArray, float]:
     """Covariance (k + 12, k + 12) of the error of the maximum of a posterior, and how many independent points are left
     for it after the fit.
 
-    A sandwich: that of independent points, what neighbours share, and what is not known of holes.  An entry that its
-    bound holds (a length or a share, not an angle, for which 0 is no end) has an error of its own, which the others do
-    not follow.
+    A sandwich: that of independent points, what neighbours share, and, if `holes_end_elsewhere`, what is not known of
+    holes.  An entry that its bound holds (a length or a share, not an angle, for which 0 is no end) has an error of its
+    own, which the others do not follow.
     """
     free = likelihood.free
     curvature = _curvature(likelihood, state, at)
@@ -39,8 +44,19 @@ def covariance_of(
     alone = covariance_of_independent(curvature, scores, likelihood.precision[free])
     covariance = np.zeros((len(free), len(free)))
     covariance[np.ix_(free, free)] = (alone + inverse @ shared @ inverse) * dependence.n_independent / left
-    covariance[np.ix_(free, free)] += _by_holes(likelihood, state, at, inverse)
+    if holes_end_elsewhere:
+        covariance[np.ix_(free, free)] += _by_holes(likelihood, state, at, inverse)
     return covariance, float(left)
+
+
+def grown(covariance: FloatArray, other: FloatArray, those: NDArray[np.bool_]) -> FloatArray:
+    """A covariance (k, k), more by what another (k, k) of `those` (k,) has beyond it, on the axes on which it has."""
+    part = np.ix_(those, those)
+    scale = np.sqrt(np.diag(other)[those]) + 1e-12
+    values, vectors = np.linalg.eigh((other - covariance)[part] / np.outer(scale, scale))
+    more: FloatArray = covariance.copy()
+    more[part] += (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale)
+    return more
 
 
 def misfit_of(dependence: Dependence, noise: FloatArray) -> float:

@@ -15,11 +15,11 @@ from phytofit.kernels.likelihood import CHANGES, log_density, segment_changes
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
 
-__all__ = ["NOISE", "OUTLIERS", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
+__all__ = ["LEAF_NOISE", "NOISE", "OUTLIERS", "SHARES", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 
 FloatArray = NDArray[np.float64]
 N_EXTRA = 12  # entries of theta after the model's parameters, see State
-NOISE, THICKNESS, OUTLIERS = slice(-5, -3), -3, -1  # their places in theta
+NOISE, LEAF_NOISE, THICKNESS, SHARES, OUTLIERS = slice(-5, -3), -4, -3, slice(-2, None), -1  # their places in theta
 NO_THICKNESS_CM = 1e-6
 LEAST_NOISE_CM = 0.05  # a midrib of straight pieces lies up to 0.02 cm off a curved one
 LEAST_SEEN, SEEN_SPREAD = 0.3, 0.3  # of the midrib: bound, and the prior's spread below 1
@@ -182,6 +182,21 @@ class CloudLikelihood:
         other = copy.copy(self)
         other.hidden = hidden
         other.seen = other._seen_at(other.points)
+        return other
+
+    def of_part(self, kept: NDArray[np.bool_], others: Hidden) -> "CloudLikelihood":
+        """The likelihood of the points that are `kept` (n,), all that there are but where `others` are hidden."""
+        part = copy.copy(self)
+        part.points, part.organ = self.points[kept], self.organ[kept]
+        part.weights = None if self.weights is None else self.weights[kept]
+        part.hidden, part.seen = others, np.ones(len(part.points))
+        return part
+
+    def holding(self, state: State, held: NDArray[np.bool_]) -> "CloudLikelihood":
+        """The same likelihood, with entries of theta `held` (k + 12,) where the state has them."""
+        other = copy.copy(self)
+        other.lower = np.where(held, state.theta, self.lower)
+        other.upper = np.where(held, state.theta, self.upper)
         return other
 
     def _seen_at(self, points: FloatArray) -> FloatArray:

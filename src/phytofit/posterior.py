@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
 from phytofit.beginnings import along_points, lower_insertion, turned_blade
-from phytofit.covariance import covariance_of, misfit_of
+from phytofit.covariance import covariance_of, grown, misfit_of
 from phytofit.dependence import Dependence, score_dependence, width_misfit
 from phytofit.distances import Reference, chamfer
 from phytofit.flags import Sighting, sighting
@@ -25,6 +25,7 @@ from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation, Refined, refine
 from phytofit.species import Species
 from phytofit.tip import blunt_end
+from phytofit.whole_pieces import of_whole_pieces
 
 __all__ = ["DITHER_CM", "Estimate", "estimate"]
 
@@ -54,7 +55,7 @@ LOWER_ROUNDS = 3
 
 @dataclass(frozen=True)
 class Estimate:
-    """The maximum of the posterior.
+    """The maximum of the posterior; beside holes, with the leaf's width as its whole pieces have it.
 
     ``x`` (k,) with ``covariance`` (k, k) of its error; ``pose`` (4, 4) from the model's frame to the cloud's;
     ``noise`` (3,) cm: on the stem, on the leaf, and what the leaf's thickness adds across it; ``share`` (3,) of stem,
@@ -414,11 +415,12 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     likelihood, state, at = end.likelihood, end.state, end.at
     k = state.n_parameters
     covariance, left = covariance_of(likelihood, state, at, dependence)
+    x, covariance = _with_width_of_whole_pieces(end, dependence, covariance[:k, :k])
     seen = sighting(likelihood, state, at.scores)
     too_long = state.seen == 1.0 and seen.short > EXPECTED_BEYOND * dependence.inflation
     return Estimate(
-        x=state.x.copy(),
-        covariance=covariance[:k, :k],
+        x=x,
+        covariance=covariance,
         pose=likelihood.pose_of(state),
         noise=state.noise,
         share=state.share,
@@ -440,3 +442,18 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         sighting=seen,
         dithered=dithered,
     )
+
+
+def _with_width_of_whole_pieces(
+    end: _End, dependence: Dependence, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The model's parameters (k,) and the covariance (k, k) of their error, with the leaf's width as its whole pieces
+    have it; as they are where there are no holes."""
+    k = end.state.n_parameters
+    whole = of_whole_pieces(end.likelihood, end.state)
+    if whole is None:
+        return end.state.x.copy(), covariance
+    state = whole.with_theta(end.state, _refined(whole, end.state).theta)
+    of_part = score_dependence(whole, state, dependence)
+    own, _ = covariance_of(whole, state, whole.evaluate(state), of_part, holes_end_elsewhere=False)
+    return state.x.copy(), grown(covariance, own[:k, :k], whole.free[:k])

@@ -1,0 +1,38 @@
+"""The leaf's width by those of its pieces that were seen whole: what is left beside a hole says little of it."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
+
+from phytofit.hidden import N_STRIPS, Hidden
+from phytofit.likelihood import LEAF_NOISE, SHARES, CloudLikelihood, State
+
+__all__ = ["WIDTHS", "of_whole_pieces"]
+
+FloatArray = NDArray[np.float64]
+WIDTHS = ("leaf_width", "leaf_base_width", "leaf_widest_at", "leaf_taper")  # what is told anew
+LEAST_WHOLE = 0.1  # of the leaf's pieces
+
+
+def of_whole_pieces(likelihood: CloudLikelihood, state: State) -> CloudLikelihood | None:
+    """The likelihood of the points on those pieces of the leaf that have no hole, and whose neighbours have none.
+
+    It may change the leaf's width along the midrib, the noise on the leaf and the shares; all else is held where
+    `state` has it.  None where no holes are known, or hardly a piece is whole: then nothing better is known.
+
+    Which points were left out was decided by where they lie along the leaf alone.  So the density of those that are
+    left is that of the whole leaf, divided by what it has on these pieces, and where the holes end across the blade,
+    which is not known well, has no part in it.
+    """
+    hidden = likelihood.hidden
+    if hidden is None:
+        return None
+    left_out = binary_dilation(np.any(hidden.share > 0.0, axis=1), np.ones(3))
+    if np.mean(~left_out) < LEAST_WHOLE:
+        return None
+    kept = ~left_out[hidden.leaf.nearest(likelihood.points)[0]]
+    others = Hidden(hidden.leaf, np.repeat(left_out[:, np.newaxis].astype(float), N_STRIPS, axis=1))
+    free = np.zeros(len(state.theta), bool)
+    free[: state.n_parameters] = np.isin(likelihood.space.names, WIDTHS)
+    free[LEAF_NOISE] = free[SHARES] = True
+    return likelihood.of_part(kept, others).holding(state, ~free)
