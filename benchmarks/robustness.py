@@ -352,7 +352,7 @@ def field(pool: ProcessPoolExecutor) -> None:
         for i in np.flatnonzero(off > 1.0):
             at = {
                 "noise": "",
-                "sphere": f"; its sphere's middle is {near[i]:.1f} cm from the leaf's base, {away[i]:.1f} cm from its tip",
+                "sphere": f"; its sphere: {near[i]:.1f} cm from the leaf's base, {away[i]:.1f} cm from its tip",
                 "pieces": f"; the next piece is {near[i]:.1f} cm away",
             }
             print(f"    copy {i + 1}: {value[i] - untouched:+.2f} cm{', flagged' if flagged[i] else ''}{at[how]}")
