@@ -171,16 +171,19 @@ def test_a_species_with_any_number_of_parameters(k):
     assert trait(result, "leaf_length").value == pytest.approx(55.0, abs=4.0)
 
 
-def test_holes_that_leave_the_blades_edges_are_flagged_and_hardly_widen_it():
-    """A hole of 4 cm in the middle of a blade of 6 cm, and another."""
+@pytest.mark.parametrize(
+    ("nodes", "radius", "flagged"), [((9, 15), 2.2, False), ((7, 12, 17), 3.5, True), ((6, 10, 14, 18), 4.0, True)]
+)
+def test_holes_hardly_widen_a_blade_and_many_are_flagged(nodes, radius, flagged):
+    """In a blade of 6 cm."""
     made = phytofit.simulate(fixed=GENTLE, n_points=5000, noise_cm=0.3, seed=7)
     leaf = made.organs[1]
     gone = np.zeros(len(made.points), bool)
-    for node in (9, 15):
-        gone |= np.linalg.norm(made.points - leaf.axis[node], axis=1) < 2.2
+    for node in nodes:
+        gone |= np.linalg.norm(made.points - leaf.axis[node], axis=1) < radius
     gone &= made.labels == 2
     assert gone.mean() > 0.05
     result = fitted(made, made.points[~gone])
-    assert any("of the blade has next to no points" in flag for flag in result.flags)
+    assert any("of the blade has next to no points" in flag for flag in result.flags) == flagged
     assert trait(result, "leaf_width").value == pytest.approx(6.0, abs=0.25)
     assert not any("of the blade" in flag for flag in fitted(made).flags)

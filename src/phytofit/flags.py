@@ -24,7 +24,7 @@ N_SECTORS = 12  # around the stem
 ROUND = 0.7  # share of them that must be seen
 BASE_SECTIONS = 2  # the leaf's first tenth
 END_SECTIONS = 3  # narrow: noise blurs them
-GAP, EMPTY, MANY_GAPS = 0.4, 0.1, 0.04  # of the typical number of points, twice; share of the blade
+GAP, EMPTY, MANY_GAPS = 0.4, 0.1, 0.2  # of the typical number of points, twice; share of the blade
 FEW_ON_STEM = 60  # points
 LITTLE_EXPLAINED = 0.1  # share of outliers that is worth a remark
 MUCH_NOISE_CM = 1.0
@@ -92,7 +92,7 @@ def _gaps(leaf: Organ, points: FloatArray, place: FloatArray) -> float:
     section = np.minimum((place * N_SECTIONS).astype(int), N_SECTIONS - 1)
     found = np.bincount(section * N_STRIPS + strip_of(leaf, points, N_STRIPS), minlength=N_SECTIONS * N_STRIPS)
     found = found.reshape(N_SECTIONS, N_STRIPS)[BASE_SECTIONS:-END_SECTIONS]
-    typical = float(np.quantile(found, TYPICAL))
+    typical = float(np.quantile(found[found > 0], TYPICAL)) if found.any() else 0.0
     return float(clearly_lacking(found.astype(float), np.full(found.shape, typical)).mean())
 
 
