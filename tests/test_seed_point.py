@@ -58,6 +58,20 @@ def test_a_leaf_that_touches_the_one_that_is_meant_is_left_out(crowded):
     assert length_of(result) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
 
 
+def test_a_leaf_that_hangs_below_the_stem_keeps_its_tip():
+    made = phytofit.simulate(
+        fixed=FIXED | {"leaf_length": 80.0, "stem_length": 6.0, "leaf_rotate_angle": 5.0}, n_points=3000, seed=4
+    )
+    upright = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    leaf = upright[made.labels == 2]
+    assert leaf[:, 2].min() < upright[made.labels == 1][:, 2].min() - 5.0
+    points = np.concatenate([upright, leaf[::2] * [-1.0, -1.0, 1.0]]) @ made.pose[:3, :3].T + made.pose[:3, 3]
+    result = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=made.organs[1].axis[15], threads=2)
+    left = {tuple(point) for point in result.reference.tolist()}
+    assert all(tuple(point) in left for point in points[: len(made.points)].tolist())
+    assert result.estimate.tip_seen
+
+
 def test_a_seed_point_of_a_whole_phytomer_changes_little(crowded):
     made, _, on_leaf = crowded
     with_seed = phytofit.fit(made.points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)

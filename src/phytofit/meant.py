@@ -62,7 +62,7 @@ def meant_points(
     piece[beside] = _pieces(tree, link)
     own = np.unique(piece[beside[nearest]])
     connected = np.flatnonzero(near_stem | np.isin(piece, own))
-    other = _of_other_leaves(upright[connected], seeds)
+    other = _of_other_leaves(upright[connected], seeds, start.foot)
     leaf = piece.copy()
     leaf[connected[other > 0]] = piece.max() + other[other > 0]
     leaf[near_stem] = NOBODY
@@ -86,12 +86,12 @@ def _pieces(tree: cKDTree, link: float) -> NDArray[np.int64]:
     return piece
 
 
-def _of_other_leaves(upright: FloatArray, seeds: FloatArray) -> NDArray[np.int64]:
+def _of_other_leaves(upright: FloatArray, seeds: FloatArray, foot: float) -> NDArray[np.int64]:
     """Of which other leaf, from 1, each point (n,) is, 0 of none, when stem and leaves are taken apart; seeds (k, 3)
-    lie on the one that is meant."""
+    lie on the one that is meant, and the stem begins at height `foot`."""
     none = np.zeros(len(upright), np.int64)
     try:
-        labels = segment(from_points(upright, "cm"), up="z").labels
+        labels = segment(from_points(upright, "cm"), up="z", base=[0.0, 0.0, foot]).labels
     except (CloudError, NoStemError):
         return none
     about = cKDTree(upright).query(seeds, k=N_NEAREST)[1]
