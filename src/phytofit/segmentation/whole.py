@@ -175,7 +175,12 @@ def segment(
     n_unknown = int(count[0])
     if n_unknown:
         notes.append(f"{n_unknown} of {len(cloud)} points belong to no organ")
-    settings = {"up": None if stated is None else stated.tolist(), "n_nodes": n_nodes, "labelled": labelled}
+    settings = {
+        "up": None if stated is None else stated.tolist(),
+        "base": None if base is None else np.asarray(base, float).tolist(),
+        "n_nodes": n_nodes,
+        "labelled": labelled,
+    }
     return Segmentation(cloud, labels, organs.path, organs.radius, upward, tuple(leaves), tuple(notes), settings)
 
 
