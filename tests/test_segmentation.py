@@ -279,7 +279,7 @@ def test_the_command_writes_what_can_be_given_back(five, tmp_path):
     assert len(list((out / "maize" / "phytomers").iterdir())) == 5
     said = json.loads((out / "maize" / "segmentation.json").read_text())
     assert said["input"]["sha256"] == hashlib.sha256((tmp_path / "maize.ply").read_bytes()).hexdigest()
-    assert said["settings"] == {"up": None, "n_nodes": 8000, "labelled": False}
+    assert said["settings"] == {"up": None, "base": None, "n_nodes": 8000, "labelled": False}
     written = phytofit.read_cloud(out / "maize" / "plant.ply", "cm")
     assert np.array_equal(written.labels, found.labels)
     again = ["segment", out / "maize" / "plant.ply", "--units", "cm", "--labels", "label", "--out", tmp_path / "again"]
