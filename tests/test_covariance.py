@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import phytofit
-from phytofit.covariance import covariance_of, misfit_of
+from phytofit.covariance import covariance_of, misfit_of, mixed
 from phytofit.dependence import NONE, Bell, Dependence, score_dependence
 from phytofit.likelihood import CloudLikelihood
 from phytofit.optimize import refine
@@ -16,6 +16,20 @@ NOISE = np.array([0.3, 0.4, 0.3])
 
 def dependence(stem, leaf):
     return Dependence(np.eye(2), 1.0, 100.0, stem, leaf)
+
+
+def test_the_error_where_one_of_two_models_is_right():
+    """Mean squares of errors that are drawn: the truth is about one estimate or, three times in ten, the other."""
+    random = np.random.default_rng(0)
+    a, b, apart = np.array([[1.0, 0.3], [0.3, 0.5]]), np.array([[0.2, 0.0], [0.0, 2.0]]), np.array([1.5, -0.5])
+    n = 200_000
+    there = random.random(n) < 0.3
+    truth = np.where(
+        there[:, np.newaxis],
+        apart + random.multivariate_normal([0, 0], b, n),
+        random.multivariate_normal([0, 0], a, n),
+    )
+    np.testing.assert_allclose(mixed(a, b, apart, 0.3), truth.T @ truth / n, atol=0.02)
 
 
 def test_errors_that_stem_and_leaf_share_are_no_misfit_of_the_blade():

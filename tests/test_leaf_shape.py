@@ -167,6 +167,16 @@ def test_the_collar_is_offset_by_a_share_of_the_radius(share):
     assert_same(grow(x)[:1], grow(X)[:1], 0.0)
 
 
+@pytest.mark.parametrize("ratio", [0.6, 1.0, 1.4])
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_an_offset_of_1_is_the_surface_whatever_the_stem_is_like_above(ratio, share):
+    x = X.copy()
+    x[7], x[NAMES.index("stem_diameter_above")] = share, ratio
+    stem, leaf = grow(x)
+    x0, y0, height = leaf.axis[0]
+    assert (x0, y0) == (pytest.approx(share * np.interp(height, stem.axis[:, 2], stem.half_width)), 0.0)
+
+
 @pytest.mark.parametrize("degrees", [-60.0, 0.1, 25.0, 80.0])
 def test_side_bend_turns_the_tip_sideways(degrees):
     """By that angle out of the upright plane, evenly from the base on, and not down."""

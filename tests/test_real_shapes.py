@@ -5,6 +5,7 @@ import pytest
 
 import phytofit
 from phytofit.beginnings import along_points, lower_insertion, turned_blade
+from phytofit.models.organs import frames_along
 from phytofit.posterior import _Cloud, _end
 
 GENTLE = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 15.0}
@@ -87,6 +88,61 @@ def test_a_leaf_that_hugs_the_stem_is_followed_down_to_its_insertion():
     made = grown(leaf_angle=3.0, leaf_rotate_angle=4.5, collar_offset=1.0, leaf_bow=-8.0, leaf_base_width=0.9)
     result = fitted(made)
     assert trait(result, "leaf_length").value == pytest.approx(55.0, abs=2.5)
+
+
+def rising(seed, along_cm, length=50.0, radius=1.2, noise_cm=0.3):
+    """Points (n, 3) of a leaf that is not of the model: it rises along the stem's surface, turns away from it by 32
+    degrees over 5 cm, and droops; its length, cm, from its collar."""
+    s = np.linspace(0.0, length, 301)
+    middle = 0.5 * (s[1:] + s[:-1])
+    away = 16.0 * (1.0 - np.cos(np.pi * np.clip((middle - along_cm) / 5.0, 0.0, 1.0)))
+    pitch = np.deg2rad(away + 90.0 * np.clip((middle - 10.0) / length, 0.0, 1.0) ** 1.5)
+    step = np.stack([np.sin(pitch), 0.0 * pitch, np.cos(pitch)], axis=1) * (s[1] - s[0])
+    axis = np.vstack([np.zeros(3), np.cumsum(step, axis=0)]) + np.array([radius, 0.0, 15.0])
+    half = np.interp(s / length, [0.0, 0.3, 0.66, 1.0], [1.25, 2.5, 1.75, 0.0])
+    tube, level = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 25.0]]), np.array([0.0, 1.0, 0.0])
+    stem = phytofit.Organ("stem", tube, frames_along(tube, level), np.full(2, radius))
+    leaf = phytofit.Organ("leaf", axis, frames_along(axis, level), half)
+    points = phytofit.SurfaceSampler(4000, seed, even=False).draw([stem, leaf])[0]
+    return phytofit.add_noise(points, noise_cm, np.random.default_rng(seed)), length
+
+
+@pytest.mark.parametrize("shape", [{"leaf_base_bend": 30.0}, {"leaf_rotate_angle": 4.5, "leaf_bow": -8.0}])
+def test_a_leaf_that_rises_along_its_stem_is_measured_from_its_collar(shape):
+    """Where it leaves the surface turns on a millimetre: taken a little too thick, the stem hides two centimetres."""
+    off = []
+    for seed in (5, 6, 7):
+        made = grown(seed=seed, collar_offset=1.0, leaf_angle=0.5, **shape)
+        length = trait(fitted(made), "leaf_length")
+        assert length.low < 55.0 < length.high
+        off.append(length.value - 55.0)
+    assert np.median(np.abs(off)) < 1.0
+
+
+def test_where_the_leaf_starts_is_uncertain_too():
+    """Of a leaf that is taken to start at the surface, the collar's offset keeps an error."""
+    result = fitted(grown(seed=6, collar_offset=1.0, leaf_angle=0.5, leaf_base_bend=30.0))
+    assert result.parameters["collar_offset"] == 1.0
+    low, high = result.parameter_intervals["collar_offset"]
+    assert low < 1.0 < high
+
+
+def test_a_leaf_that_the_stem_may_hide_is_flagged():
+    """The model can't turn away so late: it starts a little inside the stem, and its length counts from higher up."""
+    points, _ = rising(0, along_cm=2.0)
+    result = phytofit.fit(points, "cm", up="z", threads=2)
+    hidden = float(result.organs[1].segment_lengths.sum()) - trait(result, "leaf_length").value
+    assert result.estimate.sighting.along_stem == pytest.approx(hidden, abs=1e-6) != 0.0
+    assert any(f"may be {hidden:.2g} cm more" in flag for flag in result.flags)
+    assert trait(result, "leaf_length").high >= trait(result, "leaf_length").value + hidden
+
+
+def test_a_leaf_that_starts_inside_the_stem_is_left_there():
+    made = grown(leaf_angle=30.0, leaf_rotate_angle=4.0, collar_offset=0.2, leaf_side_bend=25.0, n_points=5000)
+    result = fitted(made)
+    assert len(result.x) > 7
+    assert result.parameters["collar_offset"] < 0.8
+    assert_held(made, result, "leaf_length", "leaf_angle")
 
 
 def test_a_leaf_that_bends_down_at_its_collar():

@@ -114,6 +114,15 @@ def test_area_of_a_tapering_blade():
     assert values(stem(4.0), tapering)["leaf_area"] == pytest.approx(36 * (2 * 3.6) / 2, rel=EXACT)
 
 
+@pytest.mark.parametrize("off", [0.0, 1e-9, -1e-9])
+def test_a_leaf_that_starts_on_the_surface_and_rises_along_it_is_whole(off):
+    """5 cm up the stem's surface, then 20 cm straight away from it; rounding must not take the first 5."""
+    line = np.array([[1.5 + off, 0.0, 5.0], [1.5 + off, 0.0, 10.0], [21.5 + off, 0.0, 10.0]])
+    assert values(stem(1.5), leaf(line))["leaf_length"] == pytest.approx(25.0, rel=EXACT)
+    inside = line - np.array([0.01, 0.0, 0.0])
+    assert values(stem(1.5), leaf(inside))["leaf_length"] == pytest.approx(19.99, abs=0.2)  # a step
+
+
 def test_a_stem_that_ends_at_the_leaf_ends_rounded():
     """Its end is taken as half a sphere, so an erect leaf leaves it after one radius and not never."""
     for degrees in (0.0, 20.0, 60.0):

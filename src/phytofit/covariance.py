@@ -8,7 +8,7 @@ from phytofit.dependence import Dependence
 from phytofit.intervals import covariance_of_independent
 from phytofit.likelihood import CloudLikelihood, Evaluation, State
 
-__all__ = ["covariance_of", "grown", "misfit_of"]
+__all__ = ["covariance_of", "grown", "misfit_of", "mixed"]
 
 FloatArray = NDArray[np.float64]
 LEAST_KNOWN = 1e-9  # information on an entry of theta, below which it is none: labels may leave no share to be told
@@ -57,6 +57,13 @@ def grown(covariance: FloatArray, other: FloatArray, those: NDArray[np.bool_]) -
     more: FloatArray = covariance.copy()
     more[part] += (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale)
     return more
+
+
+def mixed(covariance: FloatArray, other: FloatArray, apart: FloatArray, probability: float) -> FloatArray:
+    """Mean square (k, k) of the error of an estimate, where another model is right with some `probability`, whose
+    estimate lies `apart` (k,) from it; each has a covariance (k, k) (Hoeting et al., Statistical Science 14, 1999)."""
+    both: FloatArray = (1.0 - probability) * covariance + probability * (other + np.outer(apart, apart))
+    return both
 
 
 def misfit_of(dependence: Dependence, noise: FloatArray) -> float:

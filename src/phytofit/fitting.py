@@ -154,20 +154,19 @@ class Fit:
 
     def _ends(self) -> Ends:
         """How far the traits' intervals reach: by the errors of the parameters, by how far the blade's surface lies
-        off the model's where it leaves the stem, and by how far its width does."""
+        off the model's where it leaves the stem, by how far its width does, and by what the stem's surface hides."""
         assert self.estimate is not None
         space, made = self.species.space, self.estimate
         angle = np.array(space.units) == "deg"
         lower, upper = np.where(angle, -np.inf, space.lower), np.where(angle, np.inf, space.upper)
         ends = propagated(self._values, self.x, self.covariance, made.quantile, lower, upper)
         off = made.quantile * made.misfit_cm * self.scale
-        value = self._values(self.x)
-        changes = np.array([self._values(self.x, thicker=by) - value for by in (off, -off)])
+        changes = np.array([self._values(self.x, thicker=by) for by in (off, -off)]) - self._values(self.x)
         changes[:, [trait.organ == STEM for trait in self._measured(self.x)]] = 0.0
         ends = ends.with_error(np.minimum(changes, 0.0).min(axis=0), np.maximum(changes, 0.0).max(axis=0))
-        wider = [trait.name == "leaf_width" for trait in self._measured(self.x)]
-        by_width = np.where(wider, made.quantile * made.width_misfit * value, 0.0)
-        return ends.with_error(by_width, by_width)
+        names = np.array([trait.name for trait in self._measured(self.x)])
+        by_width = (names == "leaf_width") * made.quantile * made.width_misfit * self._values(self.x)
+        return ends.with_error(by_width, by_width + (names == "leaf_length") * made.sighting.along_stem * self.scale)
 
     def _values(self, x: FloatArray, *, thicker: float = 0.0, whole: bool = False) -> FloatArray:
         """Values (t,) of the traits, of a stem with a radius so much larger, of the leaf as it ends, or `whole`."""

@@ -10,8 +10,9 @@ from scipy.spatial import ConvexHull
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import LEAF, Organ, move
 from phytofit.parameters import ParameterSpace
+from phytofit.traits import measure
 
-__all__ = ["Sighting", "across_leaf", "clearly_lacking", "flags_of", "sighting", "strip_of"]
+__all__ = ["Sighting", "across_leaf", "along_stem", "clearly_lacking", "flags_of", "sighting", "strip_of"]
 
 FloatArray = NDArray[np.float64]
 N_SECTIONS = 20  # of the leaf, of equal area
@@ -30,6 +31,7 @@ LITTLE_EXPLAINED = 0.1  # share of outliers that is worth a remark
 MUCH_NOISE_CM = 1.0
 BLURRED = 2.0  # stem noises in a stem's radius, below which a tube can't be told from a filled stem
 EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which the width is not resolved
+RISES = 0.02  # of a leaf's length, which the stem's surface hides and it may be longer, that is worth a remark
 IMPLAUSIBLE = 4.0  # spreads of the prior
 BOUNDED = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width", "stem_diameter_above")
 NEAR_BOUND = 1e-6
@@ -37,6 +39,7 @@ TIP_DOUBTFUL = "whether the tip was seen can't be told: the leaf may be longer"
 BEYOND_TIP = "{:.0f} points near the leaf's tip are not explained: the leaf may go on there"
 CUT_BACK = "the fitted leaf was cut back by {:.0f} % to where its points end: {:.0f} more would be expected beyond"
 BLUNT = "the leaf ends bluntly: if its tip was not seen, it is longer"
+ALONG_STEM = "the leaf rises along its stem: its length counts from where it leaves it, and may be {:.2g} {} more"
 TIP_NOT_SEEN = "the tip was not seen: the leaf's length follows from its taper, and may be longer"
 
 
@@ -49,7 +52,8 @@ class Sighting:
     ``gaps`` share of the blade (in sections and three strips each, without its ends) that clearly has no points where
     other parts have; ``beyond`` number of points near the leaf's tip that are of no organ, 0 if there are not more than
     by chance; ``end`` share of the midrib at which the leaf's last point lies, and ``short`` how many more would be
-    expected beyond it.
+    expected beyond it; ``along_stem`` cm of the midrib that lie inside the stem, but so near its surface that they may
+    as well be outside.
     """
 
     sections: FloatArray
@@ -59,6 +63,7 @@ class Sighting:
     beyond: float
     end: float
     short: float
+    along_stem: float = 0.0
 
     @property
     def leaf(self) -> float:
@@ -84,7 +89,19 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
     beyond = _beyond_tip(likelihood, state, scores)
     end = float(across_leaf(likelihood, state)[0][on_leaf > 0.5].max(initial=0.0))
     short = float(on_leaf.sum() * (1.0 - place[on_leaf > 0.5].max(initial=0.0)))
-    return Sighting(found / typical, float(on_stem.sum()), float(shown), gaps, float(beyond), end, short)
+    risen = along_stem(likelihood, state)
+    return Sighting(found / typical, float(on_stem.sum()), float(shown), gaps, float(beyond), end, short, risen)
+
+
+def along_stem(likelihood: CloudLikelihood, state: State) -> float:
+    """How much of the midrib, cm, lies inside the stem where it starts nearer to the stem's surface than the leaf's
+    points scatter, so that it may as well be outside; 0 if that is not worth a remark."""
+    stem, leaf = (organ.row(0) for organ in likelihood.model.organs(state.x))
+    whole = float(leaf.segment_lengths.sum())
+    outside = next(trait.value for trait in measure((stem, leaf)) if trait.name == "leaf_length")
+    surface = np.interp(leaf.axis[0, 2], stem.axis[:, 2], stem.half_width)
+    near = surface - np.hypot(*leaf.axis[0, :2]) < state.noise[1]
+    return whole - outside if near and 0.0 < outside < (1.0 - RISES) * whole else 0.0
 
 
 def _gaps(leaf: Organ, points: FloatArray, place: FloatArray) -> float:
@@ -189,6 +206,8 @@ def flags_of(
     if seen.beyond:
         yield BEYOND_TIP.format(seen.beyond)
     yield from _of_what_was_seen(seen)
+    if seen.along_stem:
+        yield ALONG_STEM.format(seen.along_stem * scale, _length_unit(scale))
     if outlier_share >= LITTLE_EXPLAINED:
         yield f"the model does not explain {100 * outlier_share:.0f} % of the points"
     for name, std in zip(("stem", "leaf"), noise, strict=False):

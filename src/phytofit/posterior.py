@@ -14,10 +14,10 @@ from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
 from phytofit.beginnings import along_points, lower_insertion, turned_blade
-from phytofit.covariance import covariance_of, grown, misfit_of
+from phytofit.covariance import covariance_of, grown, misfit_of, mixed
 from phytofit.dependence import Dependence, score_dependence, width_misfit
 from phytofit.distances import Reference, chamfer
-from phytofit.flags import Sighting, sighting
+from phytofit.flags import Sighting, along_stem, sighting
 from phytofit.hidden import Hidden
 from phytofit.holes import find_holes
 from phytofit.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, Evaluation, State
@@ -50,6 +50,7 @@ RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is lik
 RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
 SAME_SHARE = 0.05
+OFFSET = "collar_offset"
 LOWER_ROUNDS = 3
 
 
@@ -146,7 +147,7 @@ def estimate(
     registration, _ = objective.register(search.mean)
     cloud = _Cloud(points, organ, executor)
     state = _drawn_in(plain, cloud, [(search.mean, registration.T_target_source), *starts])
-    chosen = _choice(_candidates(plain, species, cloud, state))
+    chosen = _at_surface(species, _choice(_candidates(plain, species, cloud, state)))
     return _estimate(chosen, tuple(search.history), dithered=points is not given)
 
 
@@ -192,6 +193,13 @@ class _End(NamedTuple):
         return float(self.at.log_p.sum() if weights is None else weights @ self.at.log_p)
 
 
+class _Elsewhere(NamedTuple):
+    """Where the leaf ends up that is free to start elsewhere than at the stem's surface, and how probable it is."""
+
+    end: _End
+    probability: float
+
+
 class _Chosen(NamedTuple):
     """The end that the cloud backs best."""
 
@@ -201,6 +209,7 @@ class _Chosen(NamedTuple):
     tip_doubtful: bool
     blunt: bool
     rival: FloatArray | None
+    elsewhere: _Elsewhere | None = None
 
 
 def _drawn_in(plain: Species, cloud: _Cloud, begun: Sequence[tuple[FloatArray, FloatArray]]) -> State:
@@ -312,6 +321,25 @@ def _choice(found: Sequence[_End]) -> _Chosen:
     return _Chosen(found[best], evidence[best], dependence, doubtful, blunt, rival)
 
 
+def _at_surface(species: Species, chosen: _Chosen) -> _Chosen:
+    """Of a leaf that rises along its stem, a little inside it, the one that starts at its surface, if that is the more
+    probable: there leaves grow, and a cloud hardly tells."""
+    free, state = chosen.end.likelihood, chosen.end.state
+    if OFFSET not in species.space.names[: state.n_parameters] or not along_stem(free, state):
+        return chosen
+    start, place = state.theta.copy(), species.space.index(OFFSET)
+    start[place] = 1.0
+    held = free.holding(free.with_theta(state, start), np.arange(len(start)) == place)
+    refined = _refined(held, free.with_theta(state, start))
+    there = held.with_theta(state, refined.theta)
+    end = _End(held, there, held.evaluate(there), refined.converged)
+    evidence = _evidence(end, chosen.dependence.inflation)
+    lead = evidence - _evidence(chosen.end, chosen.dependence.inflation)
+    if lead < 0.0:
+        return chosen
+    return chosen._replace(end=end, evidence=evidence, elsewhere=_Elsewhere(chosen.end, 1.0 / (1.0 + np.exp(lead))))
+
+
 def _end(
     species: Species,
     state: State,
@@ -405,7 +433,7 @@ def _evidence(end: _End, inflation: float) -> float:
     likelihood, theta, free, at = end.likelihood, end.state.theta, end.likelihood.free, end.at
     precision = likelihood.precision[free]
     information = (at.scores.T @ at.scores)[np.ix_(free, free)] / inflation + np.diag(precision)
-    surprise = 0.5 * np.sum((theta - likelihood.mean) ** 2 * likelihood.precision)
+    surprise = 0.5 * np.sum((theta - likelihood.mean)[free] ** 2 * precision)
     prior = 0.5 * np.sum(np.log(precision[precision > 0.0]))
     return float(at.log_p.sum() / inflation - surprise + prior - 0.5 * np.linalg.slogdet(information)[1])
 
@@ -415,6 +443,10 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     likelihood, state, at = end.likelihood, end.state, end.at
     k = state.n_parameters
     covariance, left = covariance_of(likelihood, state, at, dependence)
+    if chosen.elsewhere is not None:
+        other, p = chosen.elsewhere
+        there, _ = covariance_of(other.likelihood, other.state, other.at, dependence)
+        covariance = mixed(covariance, there, other.state.theta - state.theta, p)
     x, covariance = _with_width_of_whole_pieces(end, dependence, covariance[:k, :k])
     seen = sighting(likelihood, state, at.scores)
     too_long = state.seen == 1.0 and seen.short > EXPECTED_BEYOND * dependence.inflation

@@ -13,6 +13,7 @@ __all__ = ["CHORD_CM", "Trait", "measure"]
 
 FloatArray = NDArray[np.float64]
 CHORD_CM = 8.0  # over which leaf_angle is taken
+ROUNDING_CM = 1e-6  # within which a midrib that starts on the stem's surface does so
 STEPS_PER_SEGMENT = 64  # a midrib is followed in steps of this share of a segment to where it leaves the stem
 
 
@@ -141,7 +142,7 @@ def _leaves_stem_at(stem: Organ, leaf: Organ, node_at: FloatArray) -> float:
         share = np.clip((points - a) @ (b - a) / max((b - a) @ (b - a), 1e-300), 0.0, 1.0)
         radius = stem.half_width[j] + share * (stem.half_width[j + 1] - stem.half_width[j])
         depth = np.minimum(depth, np.linalg.norm(points - a - share[:, np.newaxis] * (b - a), axis=1) - radius)
-    if depth[0] >= 0.0:
+    if depth[0] >= -ROUNDING_CM:
         return 0.0
     outside = np.flatnonzero(depth >= 0.0)
     if len(outside) == 0:

@@ -31,7 +31,7 @@ class Phytomer:
 
     ====================== ===== =================================================================================
     stem_length_above      cm    of the stem above the height at which the leaf starts
-    collar_offset          share of the stem's radius, at which the leaf starts; 1 is the stem's surface
+    collar_offset          share of the stem's radius there, at which the leaf starts; 1 is the stem's surface
     leaf_bow               deg   that the middle of the midrib points lower than by an even bend
     leaf_wave              deg   that a quarter of the midrib points lower, three quarters higher, than by an even bend
     leaf_side_bend         deg   that the midrib turns sideways, from base to tip
@@ -140,7 +140,7 @@ class Phytomer:
         midrib = np.zeros((n, self.n_pieces + 1, 3))
         midrib[:, 1:] = np.cumsum((leaf_length / self.n_pieces)[:, np.newaxis, np.newaxis] * frame[..., 0], axis=1)
         midrib[:, :, 2] += below[:, np.newaxis]
-        midrib[:, :, 0] += (0.5 * diameter * offset)[:, np.newaxis]
+        midrib[:, :, 0] += (0.25 * diameter * (1.0 + ratio) * offset)[:, np.newaxis]
         leaf = Organ(LEAF, midrib, frame, 0.5 * leaf_width[:, np.newaxis] * self.width_profile(*profile))
         return stem, leaf
 
@@ -170,13 +170,10 @@ class Phytomer:
         offset[2] = 180.0
         if "stem_diameter_above" in names:
             above = names.index("stem_diameter_above")
-            collar = names.index("collar_offset")
             ratio = x[above]
-            other = x[0] * ratio, x[collar] / ratio, 1.0 / ratio
             turn[0, [0, above]] = ratio, x[0]
-            turn[collar, [collar, above]] = 1.0 / ratio, -x[collar] / ratio**2
             turn[above, above] = -1.0 / ratio**2
-            offset[[0, collar, above]] = other - (turn @ x)[[0, collar, above]]
+            offset[[0, above]] = np.array([x[0] * ratio, 1.0 / ratio]) - (turn @ x)[[0, above]]
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[2, 3] = x[1] + x[6]
         return turn, offset, pose
