@@ -151,15 +151,6 @@ def test_any_orientation_and_up_stated(five):
     assert stated.leaves[0].collar_height == pytest.approx(found.leaves[0].collar_height, abs=3.0)
 
 
-def test_a_stated_base_is_where_the_stem_begins(five):
-    cloud, found = cloud_of(five[0]), five[4]
-    told = phytofit.segment(cloud, up="z", base=found.stem_path[0])
-    np.testing.assert_array_equal(told.labels, found.labels)
-    tip = found.leaves[2].tip
-    other = phytofit.segment(cloud, up="z", base=tip)
-    assert np.linalg.norm(other.stem_path[0] - tip) < 3.0
-
-
 def test_the_same_cloud_gives_the_same_result(five):
     points, _, _, _, found = five
     again = phytofit.segment(cloud_of(points))
@@ -279,7 +270,7 @@ def test_the_command_writes_what_can_be_given_back(five, tmp_path):
     assert len(list((out / "maize" / "phytomers").iterdir())) == 5
     said = json.loads((out / "maize" / "segmentation.json").read_text())
     assert said["input"]["sha256"] == hashlib.sha256((tmp_path / "maize.ply").read_bytes()).hexdigest()
-    assert said["settings"] == {"up": None, "base": None, "n_nodes": 8000, "labelled": False}
+    assert said["settings"] == {"up": None, "n_nodes": 8000, "labelled": False}
     written = phytofit.read_cloud(out / "maize" / "plant.ply", "cm")
     assert np.array_equal(written.labels, found.labels)
     again = ["segment", out / "maize" / "plant.ply", "--units", "cm", "--labels", "label", "--out", tmp_path / "again"]

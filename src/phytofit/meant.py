@@ -8,10 +8,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from phytofit.cloud import from_points
-from phytofit.errors import CloudError, NoPhytomerError, NoStemError, SettingError
+from phytofit.errors import NoPhytomerError, SettingError
 from phytofit.pose import StartPose
-from phytofit.segmentation import segment
+from phytofit.segmentation.graph import geodesics, plant_graph
+from phytofit.segmentation.growing import grow
 
 __all__ = ["meant_points"]
 
@@ -22,8 +22,9 @@ LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typica
 LEAST_PIECE = 30  # points; fewer are no piece of anything, and are left to be told for outliers if they are near
 NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf, and a stray point one of what is meant
 N_AROUND = 300  # points about a seed point, by which it is told how dense the leaf's are
-N_NEAREST = 15  # points about a seed point, whose organ is the one that is meant
-STEM, NOBODY = 1, -1  # label; piece
+N_NODES = 8000  # to which the leaf and what touches it are thinned
+BESIDE_CM = 2.0  # so near to the leaf that is meant, a branch is a part of its blade
+NOBODY = -1  # piece
 
 
 def meant_points(
@@ -33,7 +34,8 @@ def meant_points(
 
     The stem is looked for, with `find_starts`, among the points that are connected with a seed point, or among all if
     it isn't there.  Beside it, pieces that no seed point is connected with are of others.  What touches the leaf is
-    told from it by taking it and the stem apart as a plant.
+    told from it by the branches of the surface on which no seed
+    point lies.
 
     Raises SettingError where a seed point is far from all points beside the stem, and what `find_starts` does.
     """
@@ -62,7 +64,7 @@ def meant_points(
     piece[beside] = _pieces(tree, link)
     own = np.unique(piece[beside[nearest]])
     connected = np.flatnonzero(near_stem | np.isin(piece, own))
-    other = _of_other_leaves(upright[connected], seeds, start.foot)
+    other = _of_other_branches(upright[connected], seeds, start.foot)
     leaf = piece.copy()
     leaf[connected[other > 0]] = piece.max() + other[other > 0]
     leaf[near_stem] = NOBODY
@@ -86,16 +88,32 @@ def _pieces(tree: cKDTree, link: float) -> NDArray[np.int64]:
     return piece
 
 
-def _of_other_leaves(upright: FloatArray, seeds: FloatArray, foot: float) -> NDArray[np.int64]:
-    """Of which other leaf, from 1, each point (n,) is, 0 of none, when stem and leaves are taken apart; seeds (k, 3)
-    lie on the one that is meant, and the stem begins at height `foot`."""
-    none = np.zeros(len(upright), np.int64)
-    try:
-        labels = segment(from_points(upright, "cm"), up="z", base=[0.0, 0.0, foot]).labels
-    except (CloudError, NoStemError):
-        return none
-    about = cKDTree(upright).query(seeds, k=N_NEAREST)[1]
-    meant = [np.bincount(labels[those]).argmax() for those in about]
-    if min(meant) <= STEM:  # not told apart
-        return none
-    return np.where((labels > STEM) & ~np.isin(labels, meant), labels, none)
+def _of_other_branches(upright: FloatArray, seeds: FloatArray, foot: float) -> NDArray[np.int64]:
+    """Of which branch that leads to no seed point each point (n,) is, from 1; 0 of none.
+
+    The surface is grown from its ends towards the stem's foot at height `foot`, as whole plants are: where ends meet,
+    their branches unite.  What is meant are the branches on which seeds (k, 3) lie, all that these lead to down the
+    stem, and all that goes on beyond the outermost of them.
+    """
+    graph = plant_graph(upright, N_NODES)
+    tree = cKDTree(graph.points)
+    distance, _ = geodesics(graph, int(tree.query([0.0, 0.0, foot])[1]))
+    regions, _ = grow(graph, distance)
+    branch = np.zeros(len(distance), np.int64)
+    for i, region in enumerate(regions):
+        branch[region.nodes] = i
+    parent = {child: i for i, region in enumerate(regions) for child in region.children}
+    outermost: dict[int, float] = {}  # of the seeds on a branch and above it, their distance
+    for seed in tree.query(seeds)[1].tolist():
+        at: int | None = int(branch[seed])
+        while at is not None:
+            outermost[at] = max(outermost.get(at, 0.0), float(distance[seed]))
+            at = parent.get(at)
+    meant = list(outermost)
+    for i in meant:  # grows
+        reached = outermost.get(i, 0.0) - NEAREST_CM
+        meant += [child for child in regions[i].children if child not in outermost and regions[child].level >= reached]
+    of_point = branch[tree.query(upright)[1]]
+    other = ~np.isin(of_point, meant)
+    other[other] = cKDTree(upright[~other]).query(upright[other])[0] > BESIDE_CM  # a strip of the same blade is not
+    return np.where(other, of_point + 1, 0)

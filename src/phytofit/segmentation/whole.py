@@ -92,7 +92,6 @@ def segment(
     cloud: PointCloud,
     *,
     up: str | ArrayLike | None = None,
-    base: ArrayLike | None = None,
     n_nodes: int = 8000,
     labelled: bool = False,
 ) -> Segmentation:
@@ -108,8 +107,6 @@ def segment(
     up
         The upward direction where it is known, as for :func:`phytofit.fit`; else it is told by the plant: the stem's
         base is the end that is round, and from which the leaves part forwards and droop.
-    base
-        (3,) cm, where the stem begins, if that is known; else it is found.
     n_nodes
         Places that the cloud is thinned to; labels are carried back to all points.
     labelled
@@ -143,7 +140,7 @@ def segment(
             notes.append(f"{share:.0f} % of the points are ground or pot")
         above = np.flatnonzero(~ground)
         try:
-            graph, distance, organs = _found(points[above], direction, base, n_nodes)
+            graph, distance, organs = _found(points[above], direction, n_nodes)
         except NoStemError as error:
             raise NoStemError(f"{cloud.name}: {error}") from None
         if graph.n_bridges:
@@ -175,12 +172,7 @@ def segment(
     n_unknown = int(count[0])
     if n_unknown:
         notes.append(f"{n_unknown} of {len(cloud)} points belong to no organ")
-    settings = {
-        "up": None if stated is None else stated.tolist(),
-        "base": None if base is None else np.asarray(base, float).tolist(),
-        "n_nodes": n_nodes,
-        "labelled": labelled,
-    }
+    settings = {"up": None if stated is None else stated.tolist(), "n_nodes": n_nodes, "labelled": labelled}
     return Segmentation(cloud, labels, organs.path, organs.radius, upward, tuple(leaves), tuple(notes), settings)
 
 
@@ -195,17 +187,13 @@ def _beside(out: FloatArray, leaf: SegmentedLeaf, path: FloatArray) -> NDArray[n
     return beside
 
 
-def _found(
-    points: FloatArray, up: FloatArray | None, base: ArrayLike | None, n_nodes: int
-) -> tuple[PlantGraph, FloatArray, Organs]:
+def _found(points: FloatArray, up: FloatArray | None, n_nodes: int) -> tuple[PlantGraph, FloatArray, Organs]:
     """Graph, distances from the base and organs of a plant's points."""
-    if base is None:
-        rough = plant_graph(points, min(N_ROOT_NODES, n_nodes))
-        root = find_root(rough, up)
-        base = None if root is None else rough.points[root]
-    if base is not None:
+    rough = plant_graph(points, min(N_ROOT_NODES, n_nodes))
+    root = find_root(rough, up)
+    if root is not None:
         graph = plant_graph(points, n_nodes)
-        distance, _ = geodesics(graph, int(cKDTree(graph.points).query(base)[1]))
+        distance, _ = geodesics(graph, int(cKDTree(graph.points).query(rough.points[root])[1]))
         organs = find_organs(graph, distance, *grow(graph, distance))
         if organs is not None and len(organs.path) > 1:
             return graph, distance, organs
