@@ -252,3 +252,12 @@ def test_every_cloud_of_the_paper_in_three_orientations(path):
         moved = phytofit.fit(turned, method="paper")
         assert values(moved)["leaf_length"] == pytest.approx(values(given)["leaf_length"], abs=2.0)
         assert angle_deg(moved.pose[:3, 2], turn[:3, :3] @ given.pose[:3, 2]) < max(1.0, 2.0 * spread)
+
+
+def test_the_stem_of_a_large_cloud_is_looked_for_in_a_part_of_it():
+    made = phytofit.simulate(n_points=150_000, noise_cm=0.2, seed=3)
+    result = phytofit.fit(made.points, "cm", seed_point=made.organs[1].axis[12], threads=2)
+    assert len(result.reference) == 10_000
+    true = {t.name: t.value for t in phytofit.measure(made.organs)}
+    for trait in result.traits:
+        assert trait.value == pytest.approx(true[trait.name], rel=0.02, abs=0.1)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from phytofit.errors import NoPhytomerError, SettingError
 from phytofit.pose import StartPose
-from phytofit.segmentation.graph import geodesics, plant_graph
+from phytofit.segmentation.graph import coarse, geodesics, plant_graph
 from phytofit.segmentation.growing import grow
 
 __all__ = ["meant_points"]
@@ -39,6 +39,13 @@ def meant_points(
 
     Raises SettingError where a seed point is far from all points beside the stem, and what `find_starts` does.
     """
+    first, stands_for = coarse(points)
+    return _meant(points[first], seed_points, find_starts)[stands_for]
+
+
+def _meant(
+    points: FloatArray, seed_points: FloatArray, find_starts: Callable[[FloatArray], list[StartPose]]
+) -> BoolArray:
     tree = cKDTree(points)
     link = _link(tree, tree.query(seed_points, k=min(N_AROUND, len(points)))[1].ravel())
     piece = _pieces(tree, link)

@@ -14,6 +14,7 @@ from phytofit.species import Species
 __all__ = ["Prepared", "prepare"]
 
 FloatArray = NDArray[np.float64]
+N_LOOKED_AT = 100_000  # points, if they are all kept for the fit, in which the stem is looked for
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
 
 
@@ -55,9 +56,9 @@ def prepare(
 
     seed_points : (k, 3) in the cloud's unit, on the leaf that is meant: beside the stem no other leaf's points count
     """
-    clean = used = cloud.take(remove_outliers(cloud.points))
-    if with_outliers:
-        used = cloud
+    looked_at = cloud.take(_some(len(cloud), N_LOOKED_AT)) if with_outliers else cloud
+    clean = looked_at.take(remove_outliers(looked_at.points))
+    used = cloud if with_outliers else clean
     scale = size_cm(clean.points) / _expected_size(species) if cloud.unit == "none" else 1.0
     find_starts = partial(start_poses, stem_radius=_largest_stem_radius(species), up=up)
     if seed_points is not None:
