@@ -137,7 +137,7 @@ OUTLIERS, POINTS = (0.0, 0.1, 0.2, 0.3, 0.4), (300.0, 1000.0, 2500.0, 5000.0)
 VIEWS, OTHERS = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0), (1.0, 2.0, 4.0)
 SWEEPS = {
     "noise": Sweep("cm", NOISE, NOISE[:5], with_noise, noise_cm=0.0),
-    HOLED: Sweep("share", HOLES, HOLES[:3], with_holes),
+    HOLED: Sweep("share", HOLES, HOLES[:2], with_holes),
     "tip cut off": Sweep("share of the midrib", TIPS, TIPS, without_tip),
     "outliers": Sweep("share of the points", OUTLIERS, OUTLIERS, with_outliers),
     "views": Sweep("cameras around the plant", VIEWS, VIEWS[2:], from_cameras),
@@ -201,14 +201,14 @@ def peer_errors(points: np.ndarray, seed_point: np.ndarray | None, length: float
     return errors[0], errors[1]
 
 
-def sweeps(pool: ProcessPoolExecutor, phytomers: int, untouched: int, n_peers: int) -> None:
-    steps = [(name, step) for name, sweep in SWEEPS.items() for step in sweep.steps if step]
+def sweeps(pool: ProcessPoolExecutor, phytomers: int, untouched: int, n_peers: int, wanted: list[str]) -> None:
+    steps = [(name, step) for name in wanted for step in SWEEPS[name].steps if step]
     jobs = [Job(HOLED, 0.0, i, i < n_peers) for i in range(untouched)]
     jobs += [Job(name, step, i, i < n_peers) for name, step in steps for i in range(phytomers)]
     outcomes = defaultdict(list)
     for job, outcome in zip(jobs, progress(pool.map(measured, jobs, chunksize=1), len(jobs)), strict=True):
         outcomes[job[:2]].append(outcome)
-    for name in SWEEPS:
+    for name in wanted:
         outcomes[name, 0.0] = outcomes[HOLED, 0.0]
     print(
         f"\n{phytomers} simulated phytomers a step, {untouched} that are untouched (step 0 of each sweep that has one):"
@@ -223,7 +223,8 @@ def sweeps(pool: ProcessPoolExecutor, phytomers: int, untouched: int, n_peers: i
     figure = Figure(figsize=(17.0, 7.0), layout="constrained")
     axes = figure.subplots(2, 4).ravel()
     axes[-1].axis("off")
-    for ax, (name, sweep) in zip(axes, SWEEPS.items(), strict=False):
+    for ax, name in zip(axes, wanted, strict=False):
+        sweep = SWEEPS[name]
         print(f"\n{name}, {sweep.unit}")
         print(
             f"{'':>8}"
@@ -233,6 +234,8 @@ def sweeps(pool: ProcessPoolExecutor, phytomers: int, untouched: int, n_peers: i
         shown = [print_step(step, outcomes[name, step], n_peers) for step in sweep.steps]
         print_where_it_works(sweep, [o for step in sweep.works for o in outcomes[name, step] if o.found])
         lines = draw(ax, name, sweep, np.array(shown))
+    if len(wanted) < len(SWEEPS):
+        return
     axes[-1].legend(lines, [line.get_label() for line in lines], fontsize=10, loc="center")
     PICTURE.parent.mkdir(exist_ok=True)
     figure.savefig(PICTURE, dpi=110)
@@ -364,12 +367,15 @@ def main() -> None:
     parser.add_argument("--phytomers", type=int, default=100, help="a step")
     parser.add_argument("--untouched", type=int, default=300, help="step 0 of holes, tip and outliers")
     parser.add_argument(
+        "--only", nargs="+", default=list(SWEEPS), choices=list(SWEEPS), help="these sweeps; no picture"
+    )
+    parser.add_argument(
         "--peers", type=int, default=3, help="phytomers a step that the other methods measure too: they take long"
     )
     arguments = parser.parse_args()
     parts = {
         "field": field,
-        "sweeps": lambda pool: sweeps(pool, arguments.phytomers, arguments.untouched, arguments.peers),
+        "sweeps": lambda pool: sweeps(pool, arguments.phytomers, arguments.untouched, arguments.peers, arguments.only),
     }
     unknown = set(arguments.parts) - set(parts)
     if unknown:
