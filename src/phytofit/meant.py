@@ -8,7 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from phytofit.errors import NoPhytomerError, SettingError
+from phytofit.errors import NoPhytomerError, NoStemError, SettingError
 from phytofit.pose import StartPose
 from phytofit.segmentation.graph import coarse, geodesics, plant_graph
 from phytofit.segmentation.growing import grow
@@ -102,7 +102,10 @@ def _of_other_branches(upright: FloatArray, seeds: FloatArray, foot: float) -> N
     their branches unite.  What is meant are the branches on which seeds (k, 3) lie, all that these lead to down the
     stem, and all that goes on beyond the outermost of them.
     """
-    graph = plant_graph(upright, N_NODES)
+    try:
+        graph = plant_graph(upright, N_NODES)
+    except NoStemError:  # too few places to tell branches
+        return np.zeros(len(upright), np.int64)
     tree = cKDTree(graph.points)
     distance, _ = geodesics(graph, int(tree.query([0.0, 0.0, foot])[1]))
     regions, _ = grow(graph, distance)
