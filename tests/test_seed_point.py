@@ -40,6 +40,17 @@ def test_only_the_leaf_that_is_meant_is_measured(crowded):
     assert length_of(result) == pytest.approx(length_of(alone), abs=LENGTH_CM)
 
 
+@pytest.mark.parametrize(("unit", "factor", "shift"), [("mm", 10.0, 0.0), ("m", 0.01, 0.0), ("mm", 10.0, 4e8)])
+def test_a_seed_point_is_in_the_unit_and_frame_of_the_cloud(crowded, unit, factor, shift):
+    made, points, on_leaf = crowded
+    in_cm = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
+    other = phytofit.fit(
+        points * factor + shift, unit, up=made.pose[:3, 2], seed_point=on_leaf * factor + shift, threads=2
+    )
+    assert length_of(other) == pytest.approx(length_of(in_cm), abs=0.01)
+    assert len(other.reference) == len(in_cm.reference)
+
+
 def test_a_leaf_that_touches_the_one_that_is_meant_is_left_out(crowded):
     made, _, on_leaf = crowded
     upright = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
@@ -97,7 +108,7 @@ def test_what_is_no_point_is_refused(crowded, wrong):
 
 
 def test_a_point_far_from_every_leaf_is_refused(crowded):
-    with pytest.raises(phytofit.SettingError, match=r"the nearest is .* cm away"):
+    with pytest.raises(phytofit.SettingError, match=r"in the unit of the cloud; the nearest .* cm away"):
         phytofit.fit(crowded[0].points, "cm", seed_point=[500.0, 0.0, 0.0])
 
 

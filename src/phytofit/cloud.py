@@ -68,6 +68,11 @@ class PointCloud:
         shifted: NDArray[np.float64] = (points + self.offset) / SCALE_CM[self.unit]
         return shifted
 
+    def from_input_frame(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (m, 3) in the unit and the frame that this cloud was read in, as cm in its own."""
+        shifted: NDArray[np.float64] = points * SCALE_CM[self.unit] - self.offset
+        return shifted
+
     def with_note(self, text: str) -> "PointCloud":
         """Return the same cloud with one more remark."""
         return replace(self, notes=(*self.notes, text))

@@ -211,8 +211,8 @@ def fit(
     units : "cm", "mm", "m", or "none" for relative lengths; needed for bare points
     species : name of a species that comes with phytofit, a TOML file, or a Species
     up : "x", "-x", .. "-z" or a vector, where the upward direction is known
-    seed_point : (3,) or (k, 3) in the cloud's unit, on the leaf that is meant, where the cloud shows others as well:
-        beside the stem, what is not of its leaf is left out; one for each piece of a leaf in pieces
+    seed_point : (3,) or (k, 3) in the unit and frame that the cloud was read in, on the leaf that is meant, where the
+        cloud shows others too: beside the stem, what is not of its leaf is left out; one for each piece of a leaf
     method : "likelihood", the most probable phytomer, with intervals; or "paper", the cross-entropy search of Sodhi et
         al., IROS 2018, for the least distance between the clouds
     distance : what the paper's method minimises: hausdorff (its own), quantile, chamfer, labels
@@ -258,7 +258,7 @@ def fit(
         n_points=used["n_points"],
         up=direction,
         with_outliers=method == "likelihood",
-        seed_points=seed_points,
+        seed_points=None if seed_points is None else cloud.from_input_frame(seed_points),
     )
     means = [mean_at(start, species.leading(N_SEARCHED).space) for start in found.starts]
     if random_start:

@@ -64,8 +64,8 @@ def _meant(
     gap, nearest = tree.query(seeds)
     if np.any(gap > NEAREST_CM):
         raise SettingError(
-            f"seed_point: expected a point within {NEAREST_CM:g} cm of a leaf's, found none for "
-            f"{seed_points[np.argmax(gap)].round(2).tolist()} cm; the nearest is {gap.max():.1f} cm away"
+            f"seed_point: expected a point within {NEAREST_CM:g} cm of a leaf's, in the unit of the cloud; "
+            f"the nearest to number {np.argmax(gap) + 1} of {len(gap)} is {gap.max():.1f} cm away"
         )
     piece = np.full(len(points), NOBODY)
     piece[beside] = _pieces(tree, link)
