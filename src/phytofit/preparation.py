@@ -54,7 +54,7 @@ def prepare(
     and then thins the cloud at random: one point a voxel would change how points are spread around a surface.
     The coordinates are rounded, so that a rotated copy of the cloud gives the same numbers.
 
-    seed_points : (k, 3) cm, as the cloud's points, on the leaf that is meant: beside the stem no other leaf's points count
+    seed_points : (k, 3) cm, on the leaf that is meant: beside the stem no other leaf's points count
     """
     looked_at = cloud.take(_some(len(cloud), N_LOOKED_AT)) if with_outliers else cloud
     clean = looked_at.take(remove_outliers(looked_at.points))
