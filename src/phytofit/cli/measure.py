@@ -62,7 +62,7 @@ def fit_command(
         list[str] | None,
         typer.Option(
             metavar="X,Y,Z",
-            help="A point on the leaf that is meant, where the cloud shows others too; repeat for a leaf in pieces.",
+            help="A point on the leaf that is meant, in the cloud's unit, where others show too; one a piece.",
         ),
     ] = None,
     method: Annotated[
