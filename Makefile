@@ -53,5 +53,5 @@ bench-segment: install
 	$(BIN)/python benchmarks/plants.py
 
 docs: install
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[docs]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	$(BIN)/python -m sphinx -W -b html docs docs/_build/html
