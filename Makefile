@@ -30,7 +30,7 @@ check: install
 	$(BIN)/mypy
 
 bench: install
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[bench]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(BIN)/python benchmarks/speed.py
 
 bench-accuracy: install
@@ -43,8 +43,8 @@ bench-accuracy: install
 # The paper's tables and figures; stopped, it goes on where it was. FULL=1: without the limits. Open3D, for one picture and
 # one column, is left out where it can't be had.
 paper: install
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[paper]'
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[peers]' || true
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[paper]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[peers]' || true
 	$(BIN)/python -m evaluation $(if $(FULL),--full)
 
 bench-segment: install
