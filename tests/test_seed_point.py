@@ -69,6 +69,18 @@ def test_a_leaf_that_touches_the_one_that_is_meant_is_left_out(crowded):
     assert length_of(result) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
 
 
+def test_a_leaf_whose_base_is_hidden_has_its_own_stem():
+    made = phytofit.simulate(fixed={"leaf_width": 6.0}, n_points=3000, noise_cm=0.5, seed=2)
+    upright = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    hidden = (made.labels == 2) & (np.hypot(upright[:, 0], upright[:, 1]) < 5.0)
+    true = {t.name: t.value for t in phytofit.measure(made.organs)}
+    result = phytofit.fit(
+        made.points[~hidden], "cm", up=made.pose[:3, 2], seed_point=made.organs[1].axis[15], threads=2
+    )
+    assert length_of(result) == pytest.approx(true["leaf_length"], abs=2.0)
+    assert next(t.value for t in result.traits if t.name == "stem_diameter") == pytest.approx(2.8, abs=0.3)
+
+
 def test_a_leaf_that_hangs_below_the_stem_keeps_its_tip():
     made = phytofit.simulate(
         fixed=FIXED | {"leaf_length": 80.0, "stem_length": 6.0, "leaf_rotate_angle": 5.0}, n_points=3000, seed=4

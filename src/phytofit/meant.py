@@ -21,6 +21,7 @@ STEM_MARGIN, STEM_MARGIN_CM = 1.3, 1.0  # of its radius, and more, around a stem
 LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
 LEAST_PIECE = 30  # points; fewer are no piece of anything, and are left to be told for outliers if they are near
 NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf, and a stray point one of what is meant
+LIKELY = 0.25  # of the score of the best stem of all: leaves that look like one reach 0.14, stems are near 1
 N_AROUND = 300  # points about a seed point, by which it is told how dense the leaf's are
 N_NODES = 8000  # to which the leaf and what touches it are thinned
 BESIDE_CM = 2.0  # so near to the leaf that is meant, a branch is a part of its blade
@@ -33,9 +34,8 @@ def meant_points(
     """Which points (n, 3), cm, are of the stem or of a leaf on which seed points (k, 3) lie.
 
     The stem is looked for, with `find_starts`, among the points that are connected with a seed point, or among all if
-    it isn't there.  Beside it, pieces that no seed point is connected with are of others.  What touches the leaf is
-    told from it by the branches of the surface on which no seed
-    point lies.
+    there it is far more likely.  Beside it, pieces that no seed point is connected with are of others.  What touches
+    the leaf is told from it by the branches of the surface on which no seed point lies.
 
     Raises SettingError where a seed point is far from all points beside the stem, and what `find_starts` does.
     """
@@ -47,13 +47,11 @@ def _meant(
     points: FloatArray, seed_points: FloatArray, find_starts: Callable[[FloatArray], list[StartPose]]
 ) -> BoolArray:
     tree = cKDTree(points)
+    _check_near(tree.query(seed_points)[0])
     link = _link(tree, tree.query(seed_points, k=min(N_AROUND, len(points)))[1].ravel())
     piece = _pieces(tree, link)
     seeded = np.isin(piece, piece[tree.query(seed_points)[1]])
-    try:
-        start = find_starts(points[seeded])[0]
-    except NoPhytomerError:
-        start = find_starts(points)[0]
+    start = _likely_start(points, seeded, find_starts)
     upright = (points - start.pose[:3, 3]) @ start.pose[:3, :3]
     seeds = (seed_points - start.pose[:3, 3]) @ start.pose[:3, :3]
     margin = STEM_MARGIN * start.radius + STEM_MARGIN_CM
@@ -62,11 +60,7 @@ def _meant(
     beside = np.flatnonzero(~near_stem)
     tree = cKDTree(upright[beside])
     gap, nearest = tree.query(seeds)
-    if np.any(gap > NEAREST_CM):
-        raise SettingError(
-            f"seed_point: expected a point within {NEAREST_CM:g} cm of a leaf's, in the unit of the cloud; "
-            f"the nearest to number {np.argmax(gap) + 1} of {len(gap)} is {gap.max():.1f} cm away"
-        )
+    _check_near(gap)
     piece = np.full(len(points), NOBODY)
     piece[beside] = _pieces(tree, link)
     own = np.unique(piece[beside[nearest]])
@@ -79,6 +73,32 @@ def _meant(
     far = cKDTree(upright[near_stem | np.isin(leaf, own)]).query(upright)[0] > NEAREST_CM
     meant: BoolArray = ~(of_others | far)
     return meant
+
+
+def _likely_start(
+    points: FloatArray, seeded: BoolArray, find_starts: Callable[[FloatArray], list[StartPose]]
+) -> StartPose:
+    """The stem among the points that are connected with a seed point; or that among all, if theirs is far less likely:
+    a leaf whose base is hidden has a piece that looks a little like one."""
+    found = [starts[0] for starts in (_starts(points[seeded], find_starts), _starts(points, find_starts)) if starts]
+    if not found:
+        return find_starts(points)[0]  # which says why there is none
+    return found[0] if found[0].score >= LIKELY * found[-1].score else found[-1]
+
+
+def _starts(points: FloatArray, find_starts: Callable[[FloatArray], list[StartPose]]) -> list[StartPose]:
+    try:
+        return find_starts(points)
+    except NoPhytomerError:
+        return []
+
+
+def _check_near(gap: FloatArray) -> None:
+    if np.any(gap > NEAREST_CM):
+        raise SettingError(
+            f"seed_point: expected a point within {NEAREST_CM:g} cm of a leaf's, in the unit of the cloud; "
+            f"the nearest to number {np.argmax(gap) + 1} of {len(gap)} is {gap.max():.1f} cm away"
+        )
 
 
 def _link(tree: cKDTree, about: NDArray[np.intp]) -> float:
