@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import pinvh
 from scipy.spatial import cKDTree
-from scipy.special import stdtrit
+from scipy.special import expit, stdtrit
 
 from phytofit.beginnings import along_points, lower_insertion, turned_blade
 from phytofit.covariance import covariance_of, grown, misfit_of, mixed
@@ -197,6 +197,7 @@ class _Elsewhere(NamedTuple):
     """Where the leaf ends up that is free to start elsewhere than at the stem's surface, and how probable it is."""
 
     end: _End
+    dependence: Dependence
     probability: float
 
 
@@ -333,11 +334,15 @@ def _at_surface(species: Species, chosen: _Chosen) -> _Chosen:
     refined = _refined(held, free.with_theta(state, start))
     there = held.with_theta(state, refined.theta)
     end = _End(held, there, held.evaluate(there), refined.converged)
-    evidence = _evidence(end, chosen.dependence.inflation)
-    lead = evidence - _evidence(chosen.end, chosen.dependence.inflation)
+    lead = _evidence(end, chosen.dependence.inflation) - _evidence(chosen.end, chosen.dependence.inflation)
     if lead < 0.0:
         return chosen
-    return chosen._replace(end=end, evidence=evidence, elsewhere=_Elsewhere(chosen.end, 1.0 / (1.0 + np.exp(lead))))
+    return chosen._replace(
+        end=end,
+        evidence=chosen.evidence + lead,
+        dependence=score_dependence(held, there, chosen.dependence),
+        elsewhere=_Elsewhere(chosen.end, chosen.dependence, float(expit(-lead))),
+    )
 
 
 def _end(
@@ -444,8 +449,8 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
     k = state.n_parameters
     covariance, left = covariance_of(likelihood, state, at, dependence)
     if chosen.elsewhere is not None:
-        other, p = chosen.elsewhere
-        there, _ = covariance_of(other.likelihood, other.state, other.at, dependence)
+        other, of_other, p = chosen.elsewhere
+        there, _ = covariance_of(other.likelihood, other.state, other.at, of_other)
         covariance = mixed(covariance, there, other.state.theta - state.theta, p)
     x, covariance = _with_width_of_whole_pieces(end, dependence, covariance[:k, :k])
     seen = sighting(likelihood, state, at.scores)
