@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import phytofit
-from phytofit import CloudError, NoPhytomerError, SettingError, SpeciesError, Status, UnitError
+from phytofit import CloudError, NoPhytomerError, SettingError, SpeciesError, Status, UnitError, preparation
 
 SMALL = {"method": "paper", "n_samples": 120, "n_points": 800, "n_generations": 5, "threads": 2}
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "sodhi2018"
@@ -254,10 +254,19 @@ def test_every_cloud_of_the_paper_in_three_orientations(path):
         assert angle_deg(moved.pose[:3, 2], turn[:3, :3] @ given.pose[:3, 2]) < max(1.0, 2.0 * spread)
 
 
-def test_the_stem_of_a_large_cloud_is_looked_for_in_a_part_of_it():
-    made = phytofit.simulate(n_points=150_000, noise_cm=0.2, seed=3)
-    result = phytofit.fit(made.points, "cm", seed_point=made.organs[1].axis[12], threads=2)
-    assert len(result.reference) == 10_000
-    true = {t.name: t.value for t in phytofit.measure(made.organs)}
-    for trait in result.traits:
-        assert trait.value == pytest.approx(true[trait.name], rel=0.02, abs=0.1)
+def test_the_stem_of_a_large_cloud_is_looked_for_in_a_part_of_it(monkeypatch):
+    made, sizes, start_poses = phytofit.simulate(n_points=150_000, noise_cm=0.2, seed=3), [], preparation.start_poses
+
+    def counted(points, **more):
+        sizes.append(len(points))
+        return start_poses(points, **more)
+
+    monkeypatch.setattr(preparation, "start_poses", counted)
+    for seed_point in (None, made.organs[1].axis[12]):
+        result = phytofit.fit(made.points, "cm", seed_point=seed_point, threads=2)
+        assert len(result.reference) == 10_000
+        true = {t.name: t.value for t in phytofit.measure(made.organs)}
+        for trait in result.traits:
+            assert trait.value == pytest.approx(true[trait.name], rel=0.02, abs=0.1)
+    assert sizes[0] <= 100_000  # without a seed point
+    assert max(sizes[1:]) < 150_000  # with one, of a point a voxel

@@ -227,6 +227,18 @@ def test_a_species_with_any_number_of_parameters(k):
     assert trait(result, "leaf_length").value == pytest.approx(55.0, abs=4.0)
 
 
+def test_a_leaf_of_the_papers_model_on_a_thin_stem_does_not_rise_along_it():
+    made = phytofit.simulate(
+        fixed=GENTLE | {"stem_diameter": 0.6, "leaf_angle": 35.0, "leaf_length": 25.0, "leaf_width": 3.0},
+        n_points=4000,
+        noise_cm=0.4,
+        seed=2,
+    )
+    result = fitted(made)
+    assert len(result.species.space) == 7
+    assert not any("rises along its stem" in flag for flag in result.flags)
+
+
 @pytest.mark.parametrize(
     ("nodes", "radius", "flagged"), [((9, 15), 2.2, False), ((7, 12, 17), 3.5, True), ((6, 10, 14, 18), 4.0, True)]
 )

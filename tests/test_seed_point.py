@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import phytofit
@@ -66,6 +67,23 @@ def test_a_leaf_that_touches_the_one_that_is_meant_is_left_out(crowded):
     far = other[:, 0] ** 2 + other[:, 1] ** 2 > 10.0**2
     assert np.mean([tuple(p) in left for p in own.tolist()]) > 0.9
     assert np.mean([tuple(p) in left for p in foreign[far].tolist()]) < 0.05
+    assert length_of(result) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
+
+
+def test_a_turned_copy_keeps_the_same_points(crowded):
+    made, points, on_leaf = crowded
+    turn = Rotation.from_euler("xyz", [40.0, -70.0, 200.0], degrees=True).as_matrix()
+    kept = []
+    for by in (np.eye(3), turn):
+        result = phytofit.fit(points @ by.T, "cm", up=by @ made.pose[:3, 2], seed_point=by @ on_leaf, threads=2)
+        kept.append(result.reference @ by)
+    np.testing.assert_allclose(kept[0], kept[1], atol=1e-4)
+
+
+def test_a_stray_point_far_away_changes_nothing(crowded):
+    made, points, on_leaf = crowded
+    strayed = np.concatenate([points, [[3000.0, 0.0, 0.0]]])
+    result = phytofit.fit(strayed, "none", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
     assert length_of(result) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
 
 

@@ -87,6 +87,13 @@ def test_the_width_is_that_of_a_strip_with_the_points_of_the_whole_pieces(seed):
     assert found == pytest.approx(WIDTH, abs=0.3)
 
 
+def test_points_of_a_part_that_have_moved_are_still_all_seen():
+    true, points = made(1)
+    whole = of_whole_pieces(*at_the_truth(true, points, np.isin(np.arange(30), [8, 9, 10, 18])))
+    state = whole.start(true.x[:7], true.pose, NOISE_CM)
+    np.testing.assert_array_equal(whole.at(whole.points).evaluate(state).log_p, whole.evaluate(state).log_p)
+
+
 def test_many_holes_do_not_widen_the_leaf():
     errors, held = [], []
     for seed in range(12):

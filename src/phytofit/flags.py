@@ -12,7 +12,7 @@ from phytofit.models import LEAF, Organ, move
 from phytofit.parameters import ParameterSpace
 from phytofit.traits import measure
 
-__all__ = ["Sighting", "across_leaf", "along_stem", "clearly_lacking", "flags_of", "sighting", "strip_of"]
+__all__ = ["OFFSET", "Sighting", "across_leaf", "along_stem", "clearly_lacking", "flags_of", "sighting", "strip_of"]
 
 FloatArray = NDArray[np.float64]
 N_SECTIONS = 20  # of the leaf, of equal area
@@ -31,6 +31,7 @@ LITTLE_EXPLAINED = 0.1  # share of outliers that is worth a remark
 MUCH_NOISE_CM = 1.0
 BLURRED = 2.0  # stem noises in a stem's radius, below which a tube can't be told from a filled stem
 EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which the width is not resolved
+OFFSET = "collar_offset"  # the parameter that says where a leaf starts, in the stem or at its surface
 RISES = 0.02  # of a leaf's length, which the stem's surface hides and it may be longer, that is worth a remark
 IMPLAUSIBLE = 4.0  # spreads of the prior
 BOUNDED = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width", "stem_diameter_above")
@@ -95,7 +96,9 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
 
 def along_stem(likelihood: CloudLikelihood, state: State) -> float:
     """How much of the midrib, cm, lies inside the stem where it starts nearer to the stem's surface than the leaf's
-    points scatter, so that it may as well be outside; 0 if that is not worth a remark."""
+    points scatter, so that it may as well be outside; 0 if it is not worth a remark, or the model has no such leaf."""
+    if OFFSET not in likelihood.space.names:
+        return 0.0
     stem, leaf = (organ.row(0) for organ in likelihood.model.organs(state.x))
     whole = float(leaf.segment_lengths.sum())
     outside = next(trait.value for trait in measure((stem, leaf)) if trait.name == "leaf_length")

@@ -138,6 +138,7 @@ class CloudLikelihood:
         self.organ = np.full(len(points), -1, np.int8) if organ is None else organ
         self.weights = weights
         self.hidden = hidden
+        self.is_part = False  # whether the points were chosen by `hidden`: of those that are left all were seen
         self.seen = self._seen_at(self.points)
         self.outlier_density = 1.0 / _volume(self.points)
         self._executor = executor
@@ -189,7 +190,7 @@ class CloudLikelihood:
         part = copy.copy(self)
         part.points, part.organ = self.points[kept], self.organ[kept]
         part.weights = None if self.weights is None else self.weights[kept]
-        part.hidden, part.seen = others, np.ones(len(part.points))
+        part.hidden, part.is_part, part.seen = others, True, np.ones(len(part.points))
         return part
 
     def holding(self, state: State, held: NDArray[np.bool_]) -> "CloudLikelihood":
@@ -200,7 +201,7 @@ class CloudLikelihood:
         return other
 
     def _seen_at(self, points: FloatArray) -> FloatArray:
-        return np.ones(len(points)) if self.hidden is None else 1.0 - self.hidden.at(points)
+        return np.ones(len(points)) if self.hidden is None or self.is_part else 1.0 - self.hidden.at(points)
 
     def with_theta(self, state: State, theta: FloatArray) -> State:
         return State(theta, state.pose, state.center)

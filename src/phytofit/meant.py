@@ -19,7 +19,10 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 STEM_MARGIN, STEM_MARGIN_CM = 1.3, 1.0  # of its radius, and more, around a stem within which points may be the stem's
 LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
-LEAST_PIECE = 30  # points; fewer are no piece of anything, and are left to be told for outliers if they are near
+MANY = 100_000  # points; of more, one a voxel is enough
+LEAST_PIECE = (
+    30  # points, or voxels; fewer are no piece of anything, and are left to be told for outliers if they are near
+)
 NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf, and a stray point one of what is meant
 LIKELY = 0.25  # of the score of the best stem of all: leaves that look like one reach 0.14, stems are near 1
 N_AROUND = 300  # points about a seed point, by which it is told how dense the leaf's are
@@ -39,6 +42,8 @@ def meant_points(
 
     Raises SettingError where a seed point is far from all points beside the stem, and what `find_starts` does.
     """
+    if len(points) <= MANY:
+        return _meant(points, seed_points, find_starts)
     first, stands_for = coarse(points)
     return _meant(points[first], seed_points, find_starts)[stands_for]
 

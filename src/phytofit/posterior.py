@@ -17,7 +17,7 @@ from phytofit.beginnings import along_points, lower_insertion, turned_blade
 from phytofit.covariance import covariance_of, grown, misfit_of, mixed
 from phytofit.dependence import Dependence, score_dependence, width_misfit
 from phytofit.distances import Reference, chamfer
-from phytofit.flags import Sighting, along_stem, sighting
+from phytofit.flags import OFFSET, Sighting, along_stem, sighting
 from phytofit.hidden import Hidden
 from phytofit.holes import find_holes
 from phytofit.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, Evaluation, State
@@ -50,7 +50,6 @@ RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is lik
 RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
 SAME_SHARE = 0.05
-OFFSET = "collar_offset"
 LOWER_ROUNDS = 3
 
 
@@ -326,7 +325,7 @@ def _at_surface(species: Species, chosen: _Chosen) -> _Chosen:
     """Of a leaf that rises along its stem, a little inside it, the one that starts at its surface, if that is the more
     probable: there leaves grow, and a cloud hardly tells."""
     free, state = chosen.end.likelihood, chosen.end.state
-    if OFFSET not in species.space.names[: state.n_parameters] or not along_stem(free, state):
+    if not along_stem(free, state):
         return chosen
     start, place = state.theta.copy(), species.space.index(OFFSET)
     start[place] = 1.0
@@ -452,7 +451,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         other, of_other, p = chosen.elsewhere
         there, _ = covariance_of(other.likelihood, other.state, other.at, of_other)
         covariance = mixed(covariance, there, other.state.theta - state.theta, p)
-    x, covariance = _with_width_of_whole_pieces(end, dependence, covariance[:k, :k])
+    x, covariance, converged = _with_width_of_whole_pieces(end, dependence, covariance[:k, :k])
     seen = sighting(likelihood, state, at.scores)
     too_long = state.seen == 1.0 and seen.short > EXPECTED_BEYOND * dependence.inflation
     return Estimate(
@@ -474,7 +473,7 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
         correlated_cm=dependence.leaf.reach_cm,
         rival=chosen.rival,
         quantile=float(stdtrit(left, 0.975)),
-        converged=end.converged,
+        converged=converged,
         history=history,
         sighting=seen,
         dithered=dithered,
@@ -483,14 +482,15 @@ def _estimate(chosen: _Chosen, history: tuple[Generation, ...], *, dithered: boo
 
 def _with_width_of_whole_pieces(
     end: _End, dependence: Dependence, covariance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, bool]:
     """The model's parameters (k,) and the covariance (k, k) of their error, with the leaf's width as its whole pieces
-    have it; as they are where there are no holes."""
+    have it, and whether both refinements converged; as they are where there are no holes."""
     k = end.state.n_parameters
     whole = of_whole_pieces(end.likelihood, end.state)
     if whole is None:
-        return end.state.x.copy(), covariance
-    state = whole.with_theta(end.state, _refined(whole, end.state).theta)
+        return end.state.x.copy(), covariance, end.converged
+    refined = _refined(whole, end.state)
+    state = whole.with_theta(end.state, refined.theta)
     of_part = score_dependence(whole, state, dependence)
     own, _ = covariance_of(whole, state, whole.evaluate(state), of_part, holes_end_elsewhere=False)
-    return state.x.copy(), grown(covariance, own[:k, :k], whole.free[:k])
+    return state.x.copy(), grown(covariance, own[:k, :k], whole.free[:k]), end.converged and refined.converged
