@@ -20,9 +20,7 @@ BoolArray = NDArray[np.bool_]
 STEM_MARGIN, STEM_MARGIN_CM = 1.3, 1.0  # of its radius, and more, around a stem within which points may be the stem's
 LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
 MANY = 100_000  # points; of more, one a voxel is enough
-LEAST_PIECE = (
-    30  # points, or voxels; fewer are no piece of anything, and are left to be told for outliers if they are near
-)
+LEAST_PIECE = 30  # points, or voxels; fewer are no piece of anything: those near to what is meant may be outliers
 NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf, and a stray point one of what is meant
 LIKELY = 0.25  # of the score of the best stem of all: leaves that look like one reach 0.14, stems are near 1
 N_AROUND = 300  # points about a seed point, by which it is told how dense the leaf's are
