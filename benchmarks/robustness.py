@@ -1,6 +1,6 @@
 """Where the default method stops working, and whether its flags say so first.
 
-    python benchmarks/robustness.py [field] [sweeps] [--phytomers 100] [--untouched 300] [--peers 3]
+    python benchmarks/robustness.py [field] [sweeps] [--phytomers 100] [--untouched 300] [--peers 3] [--only SWEEP ...]
 
 field    the paper's two data sets (Fig. 7): a field phytomer with 0.5 cm noise added, or without the points in a
          sphere of 6 cm; and among pieces of another phytomer and a background, with seed points on the leaf that is
@@ -147,7 +147,7 @@ SWEEPS = {
 
 
 class Job(NamedTuple):
-    """A phytomer of a step of a sweep; without either, untouched."""
+    """A phytomer of a step of a sweep, untouched at step 0; whether the peers measure it, too."""
 
     sweep: str
     step: float

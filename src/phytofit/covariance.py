@@ -21,15 +21,13 @@ def covariance_of(
     state: State,
     at: Evaluation,
     dependence: Dependence,
-    *,
-    holes_end_elsewhere: bool = True,
 ) -> tuple[FloatArray, float]:
     """Covariance (k + 12, k + 12) of the error of the maximum of a posterior, and how many independent points are left
     for it after the fit.
 
-    A sandwich: that of independent points, what neighbours share, and, if `holes_end_elsewhere`, what is not known of
-    holes.  An entry that its bound holds (a length or a share, not an angle, for which 0 is no end) has an error of its
-    own, which the others do not follow.
+    A sandwich: that of independent points, what neighbours share, and what is not known of holes.  An entry that its
+    bound holds (a length or a share, not an angle, for which 0 is no end) has an error of its own, which the others do
+    not follow.
     """
     free = likelihood.free
     curvature = _curvature(likelihood, state, at)
@@ -44,8 +42,7 @@ def covariance_of(
     alone = covariance_of_independent(curvature, scores, likelihood.precision[free])
     covariance = np.zeros((len(free), len(free)))
     covariance[np.ix_(free, free)] = (alone + inverse @ shared @ inverse) * dependence.n_independent / left
-    if holes_end_elsewhere:
-        covariance[np.ix_(free, free)] += _by_holes(likelihood, state, at, inverse)
+    covariance[np.ix_(free, free)] += _by_holes(likelihood, state, at, inverse)
     return covariance, float(left)
 
 
@@ -84,8 +81,8 @@ def _held(likelihood: CloudLikelihood, state: State, at: Evaluation) -> NDArray[
 
 def _by_holes(likelihood: CloudLikelihood, state: State, at: Evaluation, inverse: FloatArray) -> FloatArray:
     """Covariance (m, m) of the free entries of theta, of which `inverse` is that of the curvature, as it is not known
-    where holes end: to a cell either way."""
-    if likelihood.hidden is None:
+    where holes end: to a cell either way; 0 where there are none, or where points were left out on purpose."""
+    if likelihood.hidden is None or likelihood.is_part:
         return np.zeros_like(inverse)
     before = likelihood.gradient(state, at)[likelihood.free]
     shifts = []

@@ -492,5 +492,5 @@ def _with_width_of_whole_pieces(
     refined = _refined(whole, end.state)
     state = whole.with_theta(end.state, refined.theta)
     of_part = score_dependence(whole, state, dependence)
-    own, _ = covariance_of(whole, state, whole.evaluate(state), of_part, holes_end_elsewhere=False)
+    own, _ = covariance_of(whole, state, whole.evaluate(state), of_part)
     return state.x.copy(), grown(covariance, own[:k, :k], whole.free[:k]), end.converged and refined.converged
