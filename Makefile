@@ -37,6 +37,7 @@ bench-accuracy: install
 	$(BIN)/python benchmarks/trust.py
 	$(BIN)/python benchmarks/robustness.py
 	$(BIN)/python benchmarks/evidence.py
+	$(BIN)/python benchmarks/leaf_ends.py
 	$(BIN)/python benchmarks/sections.py --out docs/images
 	$(BIN)/python benchmarks/accuracy.py
 

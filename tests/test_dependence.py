@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from phytofit.dependence import NONE, Bell, _before_the_fit, _correlation, score_dependence, width_misfit
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import SurfaceSampler, move
-from phytofit.posterior import _refined
+from phytofit.refining import refinement
 from phytofit.species import load_species
 
 SAME = 1e-9  # relative; sums in float64
@@ -49,7 +49,7 @@ def scene(seed, *, n=600, k=7, width_cm=1.0, share=0.0, noise_cm=NOISE_CM):
 
 def fitted(likelihood, state):
     """The state where the likelihood is greatest: its errors are what a fit leaves of the true ones."""
-    return likelihood, State(_refined(likelihood, state).theta, state.pose, state.center)
+    return likelihood, State(refinement(likelihood, state).theta, state.pose, state.center)
 
 
 def in_standard_errors(likelihood, state, variability):

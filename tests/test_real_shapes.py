@@ -6,7 +6,7 @@ import pytest
 import phytofit
 from phytofit.beginnings import along_points, lower_insertion, turned_blade
 from phytofit.models.organs import frames_along
-from phytofit.posterior import _Cloud, _end
+from phytofit.refining import Cloud, refined_end
 
 GENTLE = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 15.0}
 REAL = {"leaf_base_width": 0.5, "leaf_widest_at": 0.4, "leaf_bow": 10.0}
@@ -47,7 +47,7 @@ def test_the_start_with_a_turned_blade_is_turned_as_the_points_lie():
     plain = SPECIES.leading(7)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
     start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(made.x[:7], np.eye(4), 1.0)
-    end = _end(plain, start, _Cloud(points, None, None))
+    end = refined_end(plain, start, Cloud(points, None, None))
     (turned,) = turned_blade(SPECIES, end.likelihood, end.state, end.at.scores)
     assert turned.x[NAMES.index("leaf_roll")] == pytest.approx(60.0, abs=15.0)
     assert turned.x[NAMES.index("leaf_twist")] == pytest.approx(30.0, abs=25.0)
@@ -58,7 +58,7 @@ def test_a_level_blade_is_not_begun_turned():
     plain = SPECIES.leading(7)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
     start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(made.x[:7], np.eye(4), 1.0)
-    end = _end(plain, start, _Cloud(points, None, None))
+    end = refined_end(plain, start, Cloud(points, None, None))
     assert list(turned_blade(SPECIES, end.likelihood, end.state, end.at.scores)) == []
 
 

@@ -6,11 +6,12 @@ from scipy.optimize import minimize_scalar
 from scipy.special import ndtr
 
 import phytofit
-from phytofit import posterior
+from phytofit import outcome
 from phytofit.covariance import grown
 from phytofit.hidden import N_STRIPS, Hidden
 from phytofit.likelihood import CloudLikelihood
 from phytofit.models import move
+from phytofit.refining import refinement
 from phytofit.whole_pieces import WIDTHS, of_whole_pieces
 
 SPECIES = phytofit.load_species().leading(7)
@@ -67,7 +68,7 @@ def test_the_width_is_that_of_a_strip_with_the_points_of_the_whole_pieces(seed):
     rows = np.isin(np.arange(30), [8, 9, 10, 18])
     whole = of_whole_pieces(*at_the_truth(true, points[true.labels > 0], rows))
     start = whole.start(true.x[:7], true.pose, NOISE_CM)
-    found = posterior._refined(whole, start).theta[4]
+    found = refinement(whole, start).theta[4]
 
     leaf = move([SPECIES.model.organs(true.x[:7])[1].row(0)], true.pose)[0]
     blade = points[true.labels == 2]
@@ -108,7 +109,7 @@ def test_many_holes_do_not_widen_the_leaf():
 def test_only_the_width_changes_and_its_interval_does_not_shrink(monkeypatch):
     _, points = made(2, REMOVED)
     told = phytofit.fit(points, "cm")
-    monkeypatch.setattr(posterior, "of_whole_pieces", lambda *of: None)
+    monkeypatch.setattr(outcome, "of_whole_pieces", lambda *of: None)
     before = phytofit.fit(points, "cm")
     others = ~np.isin(told.species.space.names, WIDTHS)
     np.testing.assert_array_equal(told.x[others], before.x[others])

@@ -25,10 +25,10 @@ from phytofit.likelihood import CloudLikelihood
 from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move
 from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
+from phytofit.outcome import Estimate
 from phytofit.parameters import Parameter, ParameterSpace
 from phytofit.plots import plot_convergence, plot_fit, plot_reconstruction, plot_segmentation
 from phytofit.pose import StartPose, start_poses
-from phytofit.posterior import Estimate
 from phytofit.preparation import Prepared, prepare
 from phytofit.recipe import recipe
 from phytofit.reconstruct import CAMERAS, Camera, Reconstruction, load_camera, reconstruct

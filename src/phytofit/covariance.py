@@ -8,7 +8,7 @@ from phytofit.dependence import Dependence
 from phytofit.intervals import covariance_of_independent
 from phytofit.likelihood import CloudLikelihood, Evaluation, State
 
-__all__ = ["covariance_of", "grown", "misfit_of", "mixed"]
+__all__ = ["covariance_of", "grown", "misfit_of", "mixed", "shared_by_neighbors"]
 
 FloatArray = NDArray[np.float64]
 LEAST_KNOWN = 1e-9  # information on an entry of theta, below which it is none: labels may leave no share to be told
@@ -66,9 +66,13 @@ def mixed(covariance: FloatArray, other: FloatArray, apart: FloatArray, probabil
 def misfit_of(dependence: Dependence, noise: FloatArray) -> float:
     """How far, cm, the blade's surface lies off the model's: by what errors of neighbours on it share beyond what those
     on the stem do, for a sensor's are on both, and are in the covariance.  ``noise`` (3,) as of a :class:`State`."""
-    shared = dependence.leaf.correlation * float(noise[1] ** 2 + noise[2] ** 2)
     of_sensor = dependence.stem.correlation * float(noise[0] ** 2)
-    return float(np.sqrt(max(0.0, shared - of_sensor)))
+    return float(np.sqrt(max(0.0, shared_by_neighbors(dependence, noise) ** 2 - of_sensor)))
+
+
+def shared_by_neighbors(dependence: Dependence, noise: FloatArray) -> float:
+    """Standard deviation, cm, of the error that neighbours on the leaf share; ``noise`` (3,) as of a :class:`State`."""
+    return float(np.sqrt(dependence.leaf.correlation * float(noise[1] ** 2 + noise[2] ** 2)))
 
 
 def _held(likelihood: CloudLikelihood, state: State, at: Evaluation) -> NDArray[np.bool_]:

@@ -20,10 +20,11 @@ from phytofit.intervals import Ends, propagated
 from phytofit.models import STEM, Organ, move
 from phytofit.objectives import PaperObjective, Registration, minimise
 from phytofit.optimize import CrossEntropy, Generation
+from phytofit.outcome import Estimate
 from phytofit.parameters import ParameterSpace
 from phytofit.parsing import parse_points, parse_up
 from phytofit.pose import StartPose
-from phytofit.posterior import DITHER_CM, Estimate, estimate
+from phytofit.posterior import DITHER_CM, estimate
 from phytofit.preparation import Prepared, prepare
 from phytofit.species import Species, load_species
 from phytofit.traits import CHORD_CM, Trait, measure
@@ -49,10 +50,10 @@ class Fit:
     """A phytomer model fitted to a cloud.
 
     ``x`` (k,) are the parameters, in the order of ``species.space``; ``pose`` (4, 4) maps the model's frame to the
-    cloud's, cm.  By method "likelihood", ``covariance`` (k, k) is that of x's error, ``error`` minus the log posterior
-    (nats), and ``estimate`` has the rest, in the start pose's frame.  By method "paper", ``covariance`` is the spread
-    of the last elite: how far the search has contracted, not how far it is from the truth; ``error`` is the distance,
-    cm, and ``registration`` tells how ICP ended (in the start pose's frame).
+    cloud's, cm.  By method "likelihood", ``covariance`` (k, k) is that of x's error, ``trait_covariance`` the same with
+    what the leaf's last points tell of its end, ``error`` minus the log posterior (nats); ``estimate`` has the rest, in
+    the start pose's frame.  By method "paper", ``covariance`` is the spread of the last elite: how far the search has
+    contracted, not how far it is from the truth; ``error`` is the distance, cm, ``registration`` how ICP ended.
 
     ``reference`` (m, 3) are the points that were fitted, in the cloud's frame, cm.  ``flags`` are remarks on the
     result in plain words, ``notes`` on what was done to the cloud.  ``relative`` says that the cloud had no unit:
@@ -72,6 +73,7 @@ class Fit:
     method: str
     registration: Registration | None = None
     estimate: Estimate | None = None
+    trait_covariance: FloatArray | None = None
     flags: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     relative: bool = False
@@ -156,10 +158,11 @@ class Fit:
         """How far the traits' intervals reach: by the errors of the parameters, by how far the blade's surface lies
         off the model's where it leaves the stem, by how far its width does, and by what the stem's surface hides."""
         assert self.estimate is not None
+        assert self.trait_covariance is not None
         space, made = self.species.space, self.estimate
         angle = np.array(space.units) == "deg"
         lower, upper = np.where(angle, -np.inf, space.lower), np.where(angle, np.inf, space.upper)
-        ends = propagated(self._values, self.x, self.covariance, made.quantile, lower, upper)
+        ends = propagated(self._values, self.x, self.trait_covariance, made.quantile, lower, upper)
         off = made.quantile * made.misfit_cm * self.scale
         changes = np.array([self._values(self.x, thicker=by) for by in (off, -off)]) - self._values(self.x)
         changes[:, [trait.organ == STEM for trait in self._measured(self.x)]] = 0.0
@@ -374,6 +377,7 @@ def fit_likelihood(
         species=species.leading(len(most_probable.x)),
         x=most_probable.x,
         covariance=most_probable.covariance,
+        trait_covariance=most_probable.trait_covariance,
         pose=most_probable.pose,
         error=most_probable.error,
         history=most_probable.history,
@@ -421,7 +425,7 @@ def _remarked(result: Fit) -> Fit:
         midrib_seen=made.seen,
         tip_seen=made.tip_seen,
         blunt=made.blunt,
-        ends_at=made.ends_at,
+        ends_at=made.ends_at if made.too_long else 1.0,
         scale=result.scale,
     )
     return replace(result, flags=(*result.flags, *flags))
@@ -460,6 +464,7 @@ def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
         result,
         x=turn @ result.x + offset,
         covariance=turn @ result.covariance @ turn.T,
+        trait_covariance=None if result.trait_covariance is None else turn @ result.trait_covariance @ turn.T,
         pose=result.pose @ pose,
         history=tuple(
             replace(g, mean=part @ g.mean + shift, cov=part @ g.cov @ part.T, best_x=part @ g.best_x + shift)

@@ -1,7 +1,4 @@
-"""How a leaf's points end: in a point, or bluntly, as they do where its tip was not seen."""
-
-from operator import attrgetter
-from typing import NamedTuple
+"""Whether a leaf's points end bluntly, as they do where its tip was not seen."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +8,7 @@ from scipy.special import ndtr
 from phytofit.flags import across_leaf
 from phytofit.likelihood import CloudLikelihood, State
 
-__all__ = ["BluntEnd", "blunt_end"]
+__all__ = ["gain_of_blunt_end"]
 
 FloatArray = NDArray[np.float64]
 WINDOW = 0.25  # of the midrib, before its end, that is looked at
@@ -21,16 +18,9 @@ FARTHEST = 10.0  # logarithms of lengths, in units of the noise, that the search
 POINTED, STRAY = 1e-3, 1e-9  # of the noise: a width that is none; density of points that the strip does not explain
 
 
-class BluntEnd(NamedTuple):
-    """``gain``: log probability, nats, that the points at the end of a whole leaf gain if it may end bluntly, infinite
-    where there are too few to tell; ``share`` of the midrib at which it then does, or that of the last point."""
-
-    gain: float
-    share: float
-
-
-def blunt_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> BluntEnd:
-    """How the points at the end of a leaf that is taken as whole would have it end.
+def gain_of_blunt_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> float:
+    """Log probability, nats, that the points at the end of a whole leaf gain if it may end bluntly; infinite where they
+    are too few to tell.
 
     A strip that narrows evenly is fitted to the places of the points along and across the last quarter of the midrib,
     by maximum likelihood: uniform, with normal noise, once to a point and once to any width.  What the rest of the leaf
@@ -47,7 +37,7 @@ def blunt_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> 
     length = float(leaf.segment_lengths.sum())
     there = (on_leaf > 0.5) & (place > 1.0 - WINDOW)
     if np.count_nonzero(there) < LEAST_THERE:
-        return BluntEnd(np.inf, float(place[on_leaf > 0.5].max(initial=0.0)))
+        return np.inf
     noise = state.noise[1]
     along, lateral = (place[there] - 1.0 + WINDOW) * length / noise, across[there, 0] / noise  # in units of the noise
     start = float(np.interp(1.0 - WINDOW, np.linspace(0.0, 1.0, len(leaf.half_width)), leaf.half_width)) / noise
@@ -64,8 +54,6 @@ def blunt_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> 
     for widths in ((), BLUNT):
         begun = [[np.log(end), np.log(start), *np.log([width * start])] for end in ends for width in widths]
         begun = begun or [[np.log(end), np.log(start)] for end in ends]
-        found = [minimize(error, x, method="Nelder-Mead", options={"maxiter": 400}) for x in begun]
-        best.append(min(found, key=attrgetter("fun")))
+        best.append(min(minimize(error, x, method="Nelder-Mead", options={"maxiter": 400}).fun for x in begun))
     pointed, blunt = best
-    end = min(float(np.exp(blunt.x[0])) * noise / length, WINDOW)
-    return BluntEnd(float(pointed.fun - blunt.fun), 1.0 - WINDOW + end)
+    return float(pointed - blunt)

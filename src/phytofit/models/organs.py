@@ -56,10 +56,10 @@ class Organ:
         return piece, along
 
     def until(self, share: float) -> "Organ":
-        """One organ from its base up to a share, more than 0, of its axis."""
+        """One organ from its base up to a share, more than 0, of its axis; straight on where that is more than 1."""
         before = np.append(0.0, np.cumsum(self.segment_lengths))
         end = share * before[-1]
-        m = max(1, int(np.searchsorted(before, (1.0 - ROUNDING) * end)))  # nodes that stay
+        m = min(max(1, int(np.searchsorted(before, (1.0 - ROUNDING) * end))), len(self.frame))  # nodes that stay
         tip = self.axis[m - 1] + (end - before[m - 1]) * self.frame[m - 1, :, 0]
         half_width = np.append(self.half_width[:m], np.interp(end, before, self.half_width))
         return Organ(self.kind, np.vstack([self.axis[:m], tip]), self.frame[:m], half_width)

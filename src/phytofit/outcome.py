@@ -1,0 +1,149 @@
+"""What a cloud says of its phytomer: the end that it backs best, and how well it determines it."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import stdtrit
+
+from phytofit.covariance import covariance_of, grown, misfit_of, mixed, shared_by_neighbors
+from phytofit.dependence import Dependence, score_dependence, width_misfit
+from phytofit.flags import Sighting, sighting
+from phytofit.leaf_end import Ending, ending
+from phytofit.optimize import Generation
+from phytofit.refining import End, refinement
+from phytofit.whole_pieces import of_whole_pieces
+
+__all__ = ["Chosen", "Elsewhere", "Estimate", "outcome"]
+
+FloatArray = NDArray[np.float64]
+EXPECTED_BEYOND = 7.0  # points that should lie beyond the last: of a whole leaf 1 in 1,100 has as many
+TAPER = "leaf_taper"  # of a leaf that has one of its own, its last points tell where it ends
+
+
+class Elsewhere(NamedTuple):
+    """Where the leaf ends up that is free to start elsewhere than at the stem's surface, and how probable it is."""
+
+    end: End
+    dependence: Dependence
+    probability: float
+
+
+class Chosen(NamedTuple):
+    """The end that the cloud backs best."""
+
+    end: End
+    evidence: float
+    dependence: Dependence
+    tip_doubtful: bool
+    blunt: bool
+    rival: FloatArray | None
+    elsewhere: Elsewhere | None = None
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The maximum of the posterior; beside holes, with the leaf's width as its whole pieces have it.
+
+    ``x`` (k,) with ``covariance`` (k, k) of its error; ``trait_covariance`` (k, k) the same, with what the leaf's last
+    points tell of its end; ``pose`` (4, 4) from the model's frame to the cloud's;
+    ``noise`` (3,) cm: on the stem, on the leaf, and what the leaf's thickness adds across it; ``share`` (3,) of stem,
+    leaf and outliers; ``seen``: share of the midrib that was seen, 1 unless the tip is missing; ``tip_seen``: whether
+    it clearly is not; ``blunt``: whether a leaf that is taken as whole ends as one without its tip; ``ends_at``: share
+    of the midrib at which the leaf ends, by its last points; ``too_long``: whether these clearly end before its tip;
+    ``log_p`` (n,) of the points;
+    ``evidence``: Laplace's approximation of the log probability of the cloud, up to a constant of the cloud;
+    ``inflation``: how many times more the errors vary than those of independent points would; ``misfit_cm``: how far
+    the blade's surface lies off the model's, as the errors that neighbours on it share say, and those on the stem do
+    not; ``width_misfit``: by what share its width is off the model's, place by place; ``correlated_cm``: how far errors
+    of neighbours on the leaf are correlated, 0 if they are not; ``rival`` (m,): parameters of the other model, if it is
+    about as probable; ``quantile``: standard errors to either side of a 95 % interval, Student's; ``sighting``: what of
+    the phytomer the cloud shows; ``dithered``: whether noise was added to the points, which had none.
+    """
+
+    x: FloatArray
+    covariance: FloatArray
+    trait_covariance: FloatArray
+    too_long: bool
+    pose: FloatArray
+    noise: FloatArray
+    share: FloatArray
+    seen: float
+    tip_seen: bool
+    blunt: bool
+    ends_at: float
+    log_p: FloatArray
+    error: float
+    evidence: float
+    inflation: float
+    misfit_cm: float
+    width_misfit: float
+    correlated_cm: float
+    rival: FloatArray | None
+    quantile: float
+    converged: bool
+    history: tuple[Generation, ...]
+    sighting: Sighting
+    dithered: bool
+
+
+def outcome(chosen: Chosen, history: tuple[Generation, ...], *, dithered: bool) -> Estimate:
+    end, dependence = chosen.end, chosen.dependence
+    likelihood, state, at = end.likelihood, end.state, end.at
+    k = state.n_parameters
+    covariance, left = covariance_of(likelihood, state, at, dependence)
+    if chosen.elsewhere is not None:
+        other, of_other, p = chosen.elsewhere
+        there, _ = covariance_of(other.likelihood, other.state, other.at, of_other)
+        covariance = mixed(covariance, there, other.state.theta - state.theta, p)
+    seen = sighting(likelihood, state, at.scores)
+    too_long = state.seen == 1.0 and seen.short > EXPECTED_BEYOND * dependence.inflation
+    ends = None
+    if state.seen == 1.0 and (too_long or TAPER in likelihood.space.names):
+        ends = ending(likelihood, state, at.scores, covariance, shared_by_neighbors(dependence, state.noise))
+    if ends is None:
+        ends = Ending(seen.end if too_long else 1.0, np.zeros_like(covariance))
+    x, covariance, converged = _with_width_of_whole_pieces(end, dependence, covariance[:k, :k])
+    return Estimate(
+        x=x,
+        covariance=covariance,
+        trait_covariance=covariance + ends.changed[:k, :k],
+        too_long=too_long,
+        pose=likelihood.pose_of(state),
+        noise=state.noise,
+        share=state.share,
+        seen=state.seen,
+        tip_seen=state.seen == 1.0 and not chosen.tip_doubtful and not seen.beyond and not too_long,
+        blunt=chosen.blunt,
+        ends_at=ends.share,
+        log_p=at.log_p,
+        error=at.error,
+        evidence=chosen.evidence,
+        inflation=dependence.inflation,
+        misfit_cm=misfit_of(dependence, state.noise),
+        width_misfit=width_misfit(likelihood, state, at.scores, dependence.leaf),
+        correlated_cm=dependence.leaf.reach_cm,
+        rival=chosen.rival,
+        quantile=float(stdtrit(left, 0.975)),
+        converged=converged,
+        history=history,
+        sighting=seen,
+        dithered=dithered,
+    )
+
+
+def _with_width_of_whole_pieces(
+    end: End, dependence: Dependence, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray, bool]:
+    """The model's parameters (k,) and the covariance (k, k) of their error, with the leaf's width as its whole pieces
+    have it, and whether both refinements converged; as they are where there are no holes."""
+    k = end.state.n_parameters
+    whole = of_whole_pieces(end.likelihood, end.state)
+    if whole is None:
+        return end.state.x.copy(), covariance, end.converged
+    refined = refinement(whole, end.state)
+    state = whole.with_theta(end.state, refined.theta)
+    of_part = score_dependence(whole, state, dependence)
+    own, _ = covariance_of(whole, state, whole.evaluate(state), of_part)
+    return state.x.copy(), grown(covariance, own[:k, :k], whole.free[:k]), end.converged and refined.converged
