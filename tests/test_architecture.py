@@ -25,7 +25,7 @@ LAYERS = [
     {"validation"},
     {"recipe"},
     {"fitting", "simulation", "reconstruct"},
-    {"preparation", "posterior"},
+    {"fitted", "preparation", "posterior"},
     {"meant", "outcome"},
     {"segmentation"},
     {"covariance", "refining"},

@@ -12,7 +12,7 @@ import pytest
 
 import phytofit
 from phytofit import Status
-from phytofit.fitting import _beside_its_rival
+from phytofit.fitted import beside_its_rival
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "sodhi2018"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data/sodhi2018 is absent")
@@ -302,7 +302,7 @@ def test_two_solutions_are_told(result):
     longer[3] += 10.0
 
     def beside(rival):
-        return _beside_its_rival(replace(result, estimate=replace(result.estimate, rival=rival))).flags
+        return beside_its_rival(replace(result, estimate=replace(result.estimate, rival=rival))).flags
 
     (flag,) = beside(longer)
     assert flag.startswith("two solutions are about as probable: leaf_length may be ")

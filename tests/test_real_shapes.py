@@ -135,6 +135,8 @@ def test_a_leaf_that_the_stem_may_hide_is_flagged():
     assert result.estimate.sighting.along_stem == pytest.approx(hidden, abs=1e-6) != 0.0
     assert any(f"may be {hidden:.2g} cm more" in flag for flag in result.flags)
     assert trait(result, "leaf_length").high >= trait(result, "leaf_length").value + hidden
+    whole = float(result.organs[1].area)
+    assert trait(result, "leaf_area").high >= whole > trait(result, "leaf_area").value
 
 
 def test_a_leaf_that_starts_inside_the_stem_is_left_there():

@@ -19,7 +19,8 @@ from phytofit.errors import (
     Status,
     UnitError,
 )
-from phytofit.fitting import Fit, fit, mean_at
+from phytofit.fitted import Fit
+from phytofit.fitting import fit, mean_at
 from phytofit.formats import read_cloud, write_cloud
 from phytofit.likelihood import CloudLikelihood
 from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move

@@ -4,8 +4,7 @@ import inspect
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,176 +13,27 @@ from threadpoolctl import threadpool_limits
 
 from phytofit.cloud import PointCloud, from_points
 from phytofit.distances import DISTANCES, Reference
-from phytofit.errors import NoPhytomerError, SettingError, Status
-from phytofit.flags import flags_of
-from phytofit.intervals import Ends, propagated
-from phytofit.models import STEM, Organ, move
-from phytofit.objectives import PaperObjective, Registration, minimise
+from phytofit.errors import SettingError, Status
+from phytofit.fitted import Fit, beside_its_rival, remarked
+from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation
-from phytofit.outcome import Estimate
 from phytofit.parameters import ParameterSpace
 from phytofit.parsing import parse_points, parse_up
 from phytofit.pose import StartPose
 from phytofit.posterior import DITHER_CM, estimate
 from phytofit.preparation import Prepared, prepare
 from phytofit.species import Species, load_species
-from phytofit.traits import CHORD_CM, Trait, measure
 
-__all__ = ["METHODS", "Fit", "fit", "mean_at"]
+__all__ = ["METHODS", "fit", "mean_at"]
 
 FloatArray = NDArray[np.float64]
 N_PAPER = 6  # parameters of Eq. (1)
 N_SEARCHED = 7  # those and the stem above the leaf
 SEARCH = ("n_samples", "n_generations", "elite_fraction", "covariance_noise")
-LEAST_ON_STEM = 10.0  # points; with fewer it is no stem
 DITHERED = f"the points had no noise: {DITHER_CM:g} cm was added, without which the likelihood can't be climbed"
-INTERVAL_METHOD = "sandwich interval"
-OPEN_WITHOUT_TIP = ("leaf_length", "leaf_area")  # no upper end where the tip was not seen
 PLAUSIBLE_LEAD = 4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
-TOLD_OF_RIVALS = ("stem_diameter", "leaf_length", "leaf_angle", "leaf_width")
 UP_DOUBTFUL = "the leaf leaves the stem downwards or bends up: is the stated up right?"
 UP_UNKNOWN = "up and down can't be told apart by this leaf: the more plausible is given; state up if it is known"
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A phytomer model fitted to a cloud.
-
-    ``x`` (k,) are the parameters, in the order of ``species.space``; ``pose`` (4, 4) maps the model's frame to the
-    cloud's, cm.  By method "likelihood", ``covariance`` (k, k) is that of x's error, ``trait_covariance`` the same with
-    what the leaf's last points tell of its end, ``error`` minus the log posterior (nats); ``estimate`` has the rest, in
-    the start pose's frame.  By method "paper", ``covariance`` is the spread of the last elite: how far the search has
-    contracted, not how far it is from the truth; ``error`` is the distance, cm, ``registration`` how ICP ended.
-
-    ``reference`` (m, 3) are the points that were fitted, in the cloud's frame, cm.  ``flags`` are remarks on the
-    result in plain words, ``notes`` on what was done to the cloud.  ``relative`` says that the cloud had no unit:
-    lengths are then relative to each other only, and ``scale`` of them make a cm of the prior (1 otherwise); `x`,
-    `history`, `registration` and `estimate` are in the prior's cm.  ``settings`` repeat the run.
-    """
-
-    species: Species
-    x: FloatArray
-    covariance: FloatArray
-    pose: FloatArray
-    error: float
-    history: tuple[Generation, ...]
-    status: Status
-    seed: int
-    reference: FloatArray
-    method: str
-    registration: Registration | None = None
-    estimate: Estimate | None = None
-    trait_covariance: FloatArray | None = None
-    flags: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    relative: bool = False
-    scale: float = 1.0
-    settings: dict[str, object] = field(default_factory=dict)
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """The parameters by name; lengths in cm (or relative), angles in degrees."""
-        return dict(zip(self.species.space.names, self._in_units(self.x).tolist(), strict=True))
-
-    @property
-    def parameter_intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % interval of each parameter, within its bounds; empty where the method gives none."""
-        if self.estimate is None:
-            return {}
-        space = self.species.space
-        half = self.estimate.quantile * np.sqrt(np.diag(self.covariance))
-        low = self._in_units(np.minimum(np.maximum(self.x - half, space.lower), self.x)).tolist()
-        high = self._in_units(np.maximum(np.minimum(self.x + half, space.upper), self.x)).tolist()
-        return dict(zip(space.names, zip(low, high, strict=True), strict=True))
-
-    def _in_units(self, x: FloatArray) -> FloatArray:
-        return np.where(np.array(self.species.space.units) == "cm", x * self.scale, x)
-
-    @property
-    def organs(self) -> tuple[Organ, ...]:
-        """Stem and leaf in the cloud's frame, cm."""
-        return move(self._organs_of(self.x), self.pose)
-
-    def _organs_of(self, x: FloatArray, *, whole: bool = False) -> tuple[Organ, ...]:
-        own = (o.row(0) for o in self.species.model.organs(x))
-        stem, leaf = (Organ(o.kind, o.axis * self.scale, o.frame, o.half_width * self.scale) for o in own)
-        return stem, leaf if whole or self.estimate is None else leaf.until(self.estimate.ends_at)
-
-    @cached_property
-    def traits(self) -> list[Trait]:
-        """The traits, measured on the fitted organs, with 95 % intervals where the method gives them.
-
-        Lengths are in "rel" in place of "cm" where the cloud had no unit.
-        """
-        traits = self._measured(self.x)
-        if self.estimate is not None:
-            ends = self._ends()
-            open_above = () if self.estimate.tip_seen else OPEN_WITHOUT_TIP
-            traits = [
-                replace(
-                    trait,
-                    low=max(0.0, trait.value - self._not_seen(trait.name) - below),
-                    high=None if trait.name in open_above else trait.value + above,
-                )
-                if np.isfinite(below + above)
-                else trait
-                for trait, below, above in zip(traits, ends.below.tolist(), ends.above.tolist(), strict=True)
-            ]
-        if not self.relative:
-            return traits
-        return [replace(trait, unit=trait.unit.replace("cm", "rel")) for trait in traits]
-
-    def _measured(self, x: FloatArray) -> list[Trait]:
-        method = self.method if self.estimate is None else f"{self.method}, 95 % {INTERVAL_METHOD}"
-        return measure(self._organs_of(x), chord_cm=self._chord_cm, method=method, flags=self.flags)
-
-    @property
-    def _chord_cm(self) -> float:
-        return np.inf if self.relative else CHORD_CM
-
-    def _not_seen(self, name: str) -> float:
-        """What of a trait is of an unseen tip, or beyond a blunt leaf's last point: its low end is without that."""
-        assert self.estimate is not None
-        made = self.estimate
-        seen = min(1.0, made.sighting.end / made.ends_at) if made.blunt else made.seen
-        if name not in OPEN_WITHOUT_TIP or seen == 1.0:
-            return 0.0
-        whole = self._organs_of(self.x)[1]
-        part = whole.until(seen)
-        if name == "leaf_area":
-            return float(whole.area - part.area)
-        return float(whole.segment_lengths.sum() - part.segment_lengths.sum())
-
-    def _ends(self) -> Ends:
-        """How far the traits' intervals reach: by the errors of the parameters, by how far the blade's surface lies
-        off the model's where it leaves the stem, by how far its width does, and by what the stem's surface hides."""
-        assert self.estimate is not None
-        assert self.trait_covariance is not None
-        space, made = self.species.space, self.estimate
-        angle = np.array(space.units) == "deg"
-        lower, upper = np.where(angle, -np.inf, space.lower), np.where(angle, np.inf, space.upper)
-        ends = propagated(self._values, self.x, self.trait_covariance, made.quantile, lower, upper)
-        off = made.quantile * made.misfit_cm * self.scale
-        changes = np.array([self._values(self.x, thicker=by) for by in (off, -off)]) - self._values(self.x)
-        changes[:, [trait.organ == STEM for trait in self._measured(self.x)]] = 0.0
-        ends = ends.with_error(np.minimum(changes, 0.0).min(axis=0), np.maximum(changes, 0.0).max(axis=0))
-        names = np.array([trait.name for trait in self._measured(self.x)])
-        by_width = (names == "leaf_width") * made.quantile * made.width_misfit * self._values(self.x)
-        return ends.with_error(by_width, by_width + (names == "leaf_length") * made.sighting.along_stem * self.scale)
-
-    def _values(self, x: FloatArray, *, thicker: float = 0.0, whole: bool = False) -> FloatArray:
-        """Values (t,) of the traits, of a stem with a radius so much larger, of the leaf as it ends, or `whole`."""
-        stem, leaf = self._organs_of(x, whole=whole)
-        stem = replace(stem, half_width=np.maximum(stem.half_width + thicker, 0.0))
-        return np.array([trait.value for trait in measure((stem, leaf), chord_cm=self._chord_cm)])
-
-    @property
-    def elite_std(self) -> dict[str, float]:
-        """Spread of each parameter in the last elite of the search; not an error of the estimate."""
-        last = np.sqrt(np.diag(self.history[-1].cov))
-        units = self.species.space.units[: len(last)]
-        scaled = [s * self.scale if unit == "cm" else s for s, unit in zip(last.tolist(), units, strict=True)]
-        return dict(zip(self.species.space.names, scaled, strict=False))
 
 
 def fit(
@@ -290,7 +140,7 @@ def fit(
             "seed_point": None if seed_points is None else seed_points.tolist(),
         },
     )
-    return _remarked(_right_way_up(_beside_its_rival(result), direction))
+    return remarked(_right_way_up(beside_its_rival(result), direction))
 
 
 def fit_paper(
@@ -403,47 +253,6 @@ def _foot_pose(start: StartPose) -> FloatArray:
 def _defaults(function: Callable[..., Fit]) -> dict[str, Any]:
     parameters = inspect.signature(function).parameters.values()
     return {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
-
-
-def _remarked(result: Fit) -> Fit:
-    """The result with the flags of what it rests on; NoPhytomerError where it rests on no stem or no leaf."""
-    made = result.estimate
-    if made is None:
-        return result
-    length = next(t.value for t in result._measured(result.x) if t.name == "leaf_length")
-    if made.sighting.stem_points < LEAST_ON_STEM or length <= 0.0:
-        raise NoPhytomerError(
-            f"no stem with a leaf was found: the best fit has {made.sighting.stem_points:.0f} points on its stem and a "
-            f"leaf of {length:.3g} cm"
-        )
-    flags = flags_of(
-        result.species.space,
-        result.x,
-        made.sighting,
-        noise=made.noise,
-        outlier_share=float(made.share[2]),
-        midrib_seen=made.seen,
-        tip_seen=made.tip_seen,
-        blunt=made.blunt,
-        ends_at=made.ends_at if made.too_long else 1.0,
-        scale=result.scale,
-    )
-    return replace(result, flags=(*result.flags, *flags))
-
-
-def _beside_its_rival(result: Fit) -> Fit:
-    """The result, with a flag if another model is about as probable and its traits lie beyond the intervals."""
-    if result.estimate is None or result.estimate.rival is None:
-        return result
-    other = dict(zip([t.name for t in result.traits], result._values(result.estimate.rival, whole=True), strict=True))
-    differ = [
-        f"{t.name} may be {other[t.name]:.3g} {t.unit}"
-        for t in result.traits
-        if t.name in TOLD_OF_RIVALS and not (t.low or 0.0) <= other[t.name] <= (np.inf if t.high is None else t.high)
-    ]
-    if not differ:
-        return result
-    return replace(result, flags=(*result.flags, f"two solutions are about as probable: {', '.join(differ)}"))
 
 
 def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:

@@ -6,7 +6,8 @@ from typing import Any
 
 from phytofit.cloud import remove_outliers, thin
 from phytofit.distances import chamfer, hausdorff, labelled_hausdorff, quantile_hausdorff
-from phytofit.fitting import METHODS, Fit, fit, fit_likelihood, fit_paper
+from phytofit.fitted import Fit
+from phytofit.fitting import METHODS, fit, fit_likelihood, fit_paper
 from phytofit.objectives import PaperObjective
 from phytofit.reconstruct import reconstruct
 from phytofit.segmentation import segment

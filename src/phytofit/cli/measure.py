@@ -32,7 +32,8 @@ from phytofit.cli.console import (
 from phytofit.cloud import PointCloud
 from phytofit.distances import DISTANCES
 from phytofit.errors import PhytofitError, SettingError
-from phytofit.fitting import METHODS, Fit, fit
+from phytofit.fitted import Fit
+from phytofit.fitting import METHODS, fit
 from phytofit.formats import read_cloud, write_cloud
 from phytofit.optimize import Generation
 from phytofit.parsing import parse_up

@@ -9,7 +9,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from phytofit.fitting import Fit
+from phytofit.fitted import Fit
 from phytofit.models import LEAF, STEM, Organ, mesh, move
 
 __all__ = ["plot_convergence", "plot_fit"]

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from phytofit.cloud import PointCloud
-from phytofit.fitting import Fit
+from phytofit.fitted import Fit
 from phytofit.models import mesh
 from phytofit.plots import plot_convergence, plot_fit
 from phytofit.recipe import recipe_of
