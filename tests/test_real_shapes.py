@@ -53,6 +53,22 @@ def test_the_start_with_a_turned_blade_is_turned_as_the_points_lie():
     assert turned.x[NAMES.index("leaf_twist")] == pytest.approx(30.0, abs=25.0)
 
 
+@pytest.mark.parametrize("roll", [-20.0, 0.0, 75.0])
+def test_a_blade_on_edge_is_begun_turned_back(roll):
+    """A rich leaf that has taken the blade's width for its thickness: where it ends is a hill of its own."""
+    made = grown(leaf_roll=roll, leaf_twist=20.0, leaf_bow=25.0, leaf_side_bend=20.0)
+    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points, thick=True)
+    x = made.x.copy()
+    x[NAMES.index("leaf_roll")] += 90.0
+    x[NAMES.index("leaf_width")] = 2.0
+    state = likelihood.start(x, made.pose, 0.3)
+    state.theta[-3] = np.log(6.0 / np.sqrt(12.0))
+    (turned,) = turned_blade(SPECIES, likelihood, state, likelihood.evaluate(state).scores)
+    assert turned.x[NAMES.index("leaf_roll")] == pytest.approx(roll, abs=10.0)
+    assert turned.x[NAMES.index("leaf_twist")] == pytest.approx(20.0, abs=15.0)
+    assert turned.x[NAMES.index("leaf_width")] == pytest.approx(6.0, rel=0.15)
+
+
 def test_a_level_blade_is_not_begun_turned():
     made = grown()
     plain = SPECIES.leading(7)

@@ -16,7 +16,7 @@ from phytofit.species import Species
 __all__ = ["along_points", "lower_insertion", "turned_blade"]
 
 FloatArray = NDArray[np.float64]
-TURNED = 30.0  # degrees from level, from which a blade is also begun turned
+TURNED = 30.0  # degrees, from which a blade is also begun turned
 LEAST_ACROSS = 20  # points that say how a half of it lies
 LOWER, LEAST_LOWER_CM = 0.12, 2.0  # of the leaf's length, by which its insertion is also tried lower down
 PRIOR_CM = 0.2  # by which its midrib may be moved to make it a spread of the prior more plausible
@@ -28,8 +28,8 @@ BENT = ("leaf_angle", "leaf_length", "leaf_rotate_angle", "leaf_bow", "leaf_wave
 
 
 def turned_blade(species: Species, likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Iterator[State]:
-    """The state with its blade turned about the midrib as the leaf's points lie across it, where that is far from
-    level: a blade on edge is a local optimum of a level one."""
+    """The state with its blade turned about the midrib as the leaf's points lie across it, where that is far from how
+    it is turned: a blade on edge is a local optimum of a level one, and the other way round."""
     names = species.space.names
     if "leaf_twist" not in names:
         return
@@ -49,7 +49,9 @@ def turned_blade(species: Species, likelihood: CloudLikelihood, state: State, sc
     twist = 2.0 * ((turn[1] - turn[0] + 90.0) % 180.0 - 90.0)
     theta = state.theta.copy()
     x = np.concatenate([state.x, species.space.mean[state.n_parameters :]])
-    x[names.index("leaf_roll")], x[names.index("leaf_twist")] = turn[0] - 0.25 * twist, twist
+    roll = x[names.index("leaf_roll")] + turn[0] - 0.25 * twist
+    x[names.index("leaf_roll")] = (roll + 90.0) % 180.0 - 90.0  # a blade has no upper side
+    x[names.index("leaf_twist")] += twist
     x[names.index("leaf_width")] = 2.0 * np.sqrt(3.0) * spread[:, 1].max()  # as of a uniform strip
     theta[-4] = np.log(spread[:, 0].mean())
     inside = np.clip(x, species.space.lower, species.space.upper)

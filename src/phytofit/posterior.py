@@ -160,7 +160,9 @@ def _rich(species: Species, cloud: Cloud, simple: End) -> tuple[End, End]:
 
 
 def _elsewhere(species: Species, cloud: Cloud, best: End, rounds: int) -> End:
-    """The best so far, or where a midrib along the points, or an insertion lower down, leads to, if it fits better."""
+    """The best so far, or where a turned blade, a midrib along the points, or an insertion lower down leads to, if it
+    fits better."""
+    best = _better(species, cloud, best, turned_blade(species, best.likelihood, best.state, best.at.scores))
     best = _better(species, cloud, best, along_points(species, best.likelihood, best.state, best.at.scores))
     for _ in range(rounds):
         lower = _better(species, cloud, best, lower_insertion(species, best.state))
