@@ -23,7 +23,7 @@ from cut_leaves import SPECIES, Leaf, leaves
 from scipy.optimize import minimize_scalar
 
 from phytofit import leaf_end
-from phytofit.fitting import mean_at
+from phytofit.fitting import N_SEARCHED, mean_at
 from phytofit.posterior import estimate
 
 
@@ -33,9 +33,9 @@ def ends_of(leaf: Leaf) -> tuple[float, float] | None:
     feet = [start.pose.copy() for start in leaf.starts]
     for foot, start in zip(feet, leaf.starts, strict=True):
         foot[:3, 3] += start.foot * start.pose[:3, 2]
-    starts = [(mean_at(start, SPECIES.space), foot) for start, foot in zip(leaf.starts, feet, strict=True)]
+    means = [mean_at(start, SPECIES.leading(N_SEARCHED).space) for start in leaf.starts]
     with mock.patch.object(leaf_end, "combined", wraps=leaf_end.combined) as combined:
-        estimate(SPECIES, leaf.points, starts, organ=leaf.organ)
+        estimate(SPECIES, leaf.points, list(zip(means, feet, strict=True)), organ=leaf.organ)
     if not combined.called:
         return None
     end, error, told = combined.call_args.args

@@ -5,7 +5,7 @@ import pytest
 
 import phytofit
 from phytofit.hidden import N_STRIPS, Hidden
-from phytofit.leaf_end import PointsEnd, combined, ending, points_end
+from phytofit.leaf_end import MISFIT, PointsEnd, combined, ending, points_end
 from phytofit.likelihood import CloudLikelihood
 from phytofit.models import Organ, move
 from phytofit.models.organs import frames_along
@@ -121,7 +121,7 @@ def test_the_end_narrows_what_is_known_of_the_tip_and_nothing_else():
     told = end_of(likelihood, state)
     after = covariance + found.changed
     assert np.linalg.eigvalsh(after).min() > 0.0
-    by_model = np.hypot(2.0, 0.01 * state.x[3])
+    by_model = np.hypot(2.0, MISFIT * state.x[3])
     assert np.sqrt(after[3, 3]) == pytest.approx(combined(state.x[3], by_model, told)[1], rel=0.02)
     others = np.arange(k) != 3
     np.testing.assert_allclose(np.diag(after)[others], np.diag(covariance)[others], rtol=0.02)
