@@ -44,7 +44,7 @@ from phytofit.dependence import score_dependence
 from phytofit.fitting import mean_at
 from phytofit.hidden import Hidden
 from phytofit.holes import find_holes
-from phytofit.likelihood import NO_THICKNESS_CM, NOISE_CM, NOISE_FACTOR, THICKNESS, CloudLikelihood, State
+from phytofit.likelihood import N_EXTRA, NO_THICKNESS_CM, NOISE_CM, NOISE_FACTOR, THICKNESS, CloudLikelihood, State
 from phytofit.optimize import refine
 from phytofit.posterior import estimate
 
@@ -52,12 +52,12 @@ SPECIES = phytofit.load_species()
 K = len(SPECIES.space)
 N_GIVEN = 7  # parameters that every model has: those of Eq. (1), and the stem above the leaf
 SHAPE = (*SPECIES.space.names[N_GIVEN:], "thickness")
-PLACE = {name: N_GIVEN + i for i, name in enumerate(SHAPE)} | {"thickness": K + 12 + THICKNESS}  # in theta
+PLACE = {name: N_GIVEN + i for i, name in enumerate(SHAPE)} | {"thickness": K + N_EXTRA + THICKNESS}  # in theta
 NEUTRAL = {**dict(zip(SHAPE, SPECIES.model.neutral[N_GIVEN:], strict=False)), "thickness": np.log(NO_THICKNESS_CM)}
 LEARNED = [*range(K), PLACE["thickness"]]  # places in theta whose prior is learned
 SIDEWAYS = [PLACE[name] for name in ("leaf_side_bend", "leaf_side_bow", "leaf_roll", "leaf_twist")]
 HELD: dict[str, tuple[str, ...]] = {"full": (), **{name: (name,) for name in SHAPE}, "all of them": SHAPE}
-POSE, POSE_STD = slice(-11, -5), np.array([3.0] * 3 + [50.0] * 3)  # radians, cm: next to nothing is known
+POSE, POSE_STD = slice(-13, -7), np.array([3.0] * 3 + [50.0] * 3)  # radians, cm: next to nothing is known
 WIDER = 3.0  # times the species file's spreads, for the fits that priors are learned from
 FLOOR = 0.2  # of the species file's spreads: a learned one is not narrower
 BEGUN_ANGLE, BEGUN_BEND, BEGUN_ROLL = (15.0, 60.0), (0.0, 4.0, 8.0), (0.0, 80.0)

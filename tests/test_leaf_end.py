@@ -59,6 +59,29 @@ def test_last_points_tell_where_a_leaf_ends(power):
     assert abs(np.mean(off)) < 0.5 * np.mean(error) + 0.1
 
 
+@pytest.mark.parametrize("short", [0.99, 0.97, 0.95])
+def test_a_model_that_is_too_short_has_no_part_in_it(short):
+    """Points beyond its tip are none of its leaf's, but lie straight on."""
+    off, error = [], []
+    for seed in range(12):
+        likelihood, state, true = scene(seed, end=0.95, power=0.6)
+        theta = state.theta.copy()
+        theta[3] *= 0.95 * short
+        told = end_of(likelihood, likelihood.with_theta(state, theta))
+        off.append(told.at - true)
+        error.append(told.error)
+    assert abs(np.mean(off)) < 0.6
+    assert np.sqrt(np.mean((np.array(off) / error) ** 2)) < 1.8
+
+
+def test_an_error_that_the_points_share_is_the_ends_too():
+    likelihood, state, _ = scene(6, end=0.97)
+    scores, covariance = likelihood.evaluate(state).scores, 1e-9 * np.eye(len(state.theta))
+    covariance[3, 3] = 4.0
+    own, shared = (ending(likelihood, state, scores, covariance, cm) for cm in (0.0, 1.0))
+    assert (covariance + shared.changed)[3, 3] > (covariance + own.changed)[3, 3] + 0.1
+
+
 @pytest.mark.parametrize("end", [0.7, 0.95])
 def test_the_model_has_no_part_in_it(end):
     likelihood, state, true = scene(3, end=end)
@@ -88,7 +111,11 @@ def test_a_hole_before_the_end_is_no_end():
 def test_too_few_points_tell_nothing():
     likelihood, state, _ = scene(1, n_points=150)
     assert end_of(likelihood, state) is None
-    assert ending(likelihood, state, likelihood.evaluate(state).scores, np.eye(len(state.theta))) is None
+    covariance = 1e-9 * np.eye(len(state.theta))
+    covariance[3, 3] = 0.01
+    alone = ending(likelihood, state, likelihood.evaluate(state).scores, covariance)
+    assert alone.share == 1.0
+    assert (covariance + alone.changed)[3, 3] == pytest.approx(0.01 + (MISFIT * state.x[3]) ** 2, rel=0.01)
 
 
 def test_more_points_tell_more():

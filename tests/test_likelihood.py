@@ -30,7 +30,7 @@ STEP = 1e-6  # of a prior's spread, or radians, cm or nats: few pieces come into
 CLEAR = 10.0  # nats; an error so much larger is no accident
 
 SPECIES = load_species()
-TURN, SHIFT, NOISE, THICKNESS = slice(-11, -8), slice(-8, -5), slice(-5, -2), -3  # places in theta
+TURN, SHIFT, FACING, NOISE, THICKNESS = slice(-13, -10), slice(-10, -7), slice(-7, -5), slice(-5, -2), -3  # in theta
 N = len(SPECIES.space)
 NEUTRAL = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0, 0.0]
 X = np.array([3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, *NEUTRAL])
@@ -69,7 +69,7 @@ def rigid(random, reach_cm=30.0):
     return pose
 
 
-def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0, organ=-1):
+def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0, organ=-1, facing=(0.0, 0.0)):
     """The kernel's density, without derivatives."""
     stem, leaf = organs
     n, m = len(points), len(leaf.frame)
@@ -81,7 +81,8 @@ def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0
         np.zeros(0),
         stem.axis[:-1], stem.frame, stem.segment_lengths, 0.5 * (stem.half_width[1:] + stem.half_width[:-1]),
         np.zeros((len(stem.frame), 9, 0)), np.zeros(0),
-        np.array(noise, float), np.array(share, float), float(outlier_density), log_p, np.empty((0, 5)),
+        np.array(facing, float), np.array(noise, float), np.array(share, float), float(outlier_density),
+        log_p, np.empty((0, 7)),
     )  # fmt: skip
     return np.exp(log_p)
 
@@ -117,8 +118,9 @@ def over_leaf(points, leaf, noise, thickness=0.0):
     return total / area
 
 
-def over_stem(points, stem, noise):
-    """Density of noisy points of a stem, by quadrature along and around it; each segment has its mean radius."""
+def over_stem(points, stem, noise, facing=(0.0, 0.0)):
+    """Density of noisy points of a stem, by quadrature along and around it, where their angle has a von Mises density;
+    each segment has its mean radius."""
     total, area = np.zeros(len(points)), 0.0
     for j, frame in enumerate(stem.frame):
         s, along = gauss(0.0, stem.segment_lengths[j], noise)
@@ -127,7 +129,8 @@ def over_stem(points, stem, noise):
         angle = 2.0 * np.pi * (np.arange(n) + 0.5) / n
         ring = radius * np.stack([np.zeros(n), np.cos(angle), np.sin(angle)], axis=1)
         local = s[:, np.newaxis, np.newaxis] * [1.0, 0.0, 0.0] + ring
-        weights = np.repeat(along / n, n) * radius
+        around = np.exp(np.cos(angle) * facing[0] + np.sin(angle) * facing[1])
+        weights = np.outer(along, around / around.sum()).ravel() * radius
         total += blurred(points, stem.axis[j] + local.reshape(-1, 3) @ frame.T, weights, frame, np.full(3, noise))
         area += weights.sum()
     return total / area
@@ -174,6 +177,20 @@ def test_a_tube_is_integrated_exactly(length, radius, noise):
     leaf = strip([[0, 0, 2], [9, 0, 2]], [1.0, 1.0])
     found = density(points, (stem, leaf), [noise, 0.3, 0.0], share=(1.0, 0.0, 0.0), organ=0)
     np.testing.assert_allclose(found, over_stem(points, stem, noise), rtol=BESSEL)
+
+
+@pytest.mark.parametrize("facing", [(0.4, -0.2), (-1.5, 2.0), (0.0, 2.5)])
+@pytest.mark.parametrize("noise", [0.1, 0.5, 3.0])
+def test_a_tube_that_faces_a_side_is_integrated_exactly(facing, noise):
+    stem = tube(4.0, 1.5)
+    rho, height = np.meshgrid([0.0, 1.2, 1.5, 1.5 + noise], [-noise, 0.0, 2.4, 4.0 + noise])
+    angle = np.arange(rho.size)
+    points = np.stack([rho.ravel() * np.cos(angle), rho.ravel() * np.sin(angle), height.ravel()], axis=1)
+    leaf = strip([[0, 0, 2], [9, 0, 2]], [1.0, 1.0])
+    found = density(points, (stem, leaf), [noise, 0.3, 0.0], share=(1.0, 0.0, 0.0), organ=0, facing=facing)
+    expected = over_stem(points, stem, noise, facing)
+    there = expected > REACH * expected.max()
+    np.testing.assert_allclose(found[there], expected[there], rtol=3.0 * BESSEL)
 
 
 def test_far_from_the_organs_only_outliers_are_left():
@@ -231,7 +248,7 @@ def test_labelled_points_count_only_on_their_organ():
 # likelihood of a cloud
 
 
-def scene(x, seed, *, n=150, noise_cm=0.4, thick=True, cut=False, executor=None):
+def scene(x, seed, *, n=150, noise_cm=0.4, thick=True, cut=False, one_sided=True, executor=None):
     """The likelihood of a noisy cloud of the phytomer x in some pose, a tenth of it outliers, and its true state.
 
     Of about every second point it is known which organ it is of.
@@ -248,6 +265,7 @@ def scene(x, seed, *, n=150, noise_cm=0.4, thick=True, cut=False, executor=None)
     likelihood = CloudLikelihood(
         species.model, species.space, points, organ=organ, thick=thick, cut=cut, executor=executor
     )
+    likelihood = likelihood.one_sided() if one_sided else likelihood
     return likelihood, likelihood.start(x, pose, noise_cm)
 
 
@@ -263,6 +281,7 @@ def disturbed(likelihood, state, random, turn=0.5):
     theta[k] = random.uniform(0.7, 0.99)
     theta[TURN] = turn * np.array([2.0, -1.0, 2.0]) / 3.0
     theta[SHIFT] = random.uniform(-3.0, 3.0, 3)
+    theta[FACING] = random.uniform(-2.0, 2.0, 2)
     theta[-5:] += random.uniform(-0.5, 0.5, 5)
     fixed = likelihood.lower == likelihood.upper
     theta[fixed] = likelihood.mean[fixed]
@@ -344,6 +363,7 @@ def test_the_error_is_that_of_the_points_and_of_the_prior():
     distance = np.concatenate(
         [
             (theta[:N] - SPECIES.space.mean) / SPECIES.space.std,
+            theta[FACING],
             (theta[NOISE] - np.log(0.3)) / np.log(3.0),
             (theta[-2:] - likelihood.mean[-2:]) / 2.5,
         ]
@@ -355,12 +375,14 @@ def test_a_state_names_what_it_holds():
     """In the cloud's frame and in cm, whatever the parameters are."""
     _, state = scene(SHAPED, 6)
     theta = state.theta.copy()
-    theta[N:] = [0.8, 0.1, 0.2, 0.3, 4.0, 5.0, 6.0, np.log(0.2), np.log(0.4), np.log(0.1), np.log(2.0), np.log(0.5)]
+    theta[N:-5] = [0.8, 0.1, 0.2, 0.3, 4.0, 5.0, 6.0, -1.0, 2.0]
+    theta[-5:] = np.log([0.2, 0.4, 0.1, 2.0, 0.5])
     named = at(state, theta)
     assert (named.n_parameters, named.seen) == (N, 0.8)
     np.testing.assert_array_equal(named.x, SHAPED)
     np.testing.assert_array_equal(named.turn, [0.1, 0.2, 0.3])
     np.testing.assert_array_equal(named.shift, [4.0, 5.0, 6.0])
+    np.testing.assert_array_equal(named.facing, [-1.0, 2.0])
     np.testing.assert_allclose(named.noise, [0.2, 0.4, 0.1], rtol=EXACT)
     np.testing.assert_allclose(named.share, [2.0 / 3.5, 1.0 / 3.5, 0.5 / 3.5], rtol=EXACT)
 
@@ -384,7 +406,13 @@ def test_the_likelihood_of_a_state_is_the_density_of_its_organs(cut):
         one = likelihood.organ == organ
         outliers = 1.0 / ConvexHull(likelihood.points).volume
         expected = density(
-            likelihood.points[one], organs, state.noise, share=state.share, outlier_density=outliers, organ=organ
+            likelihood.points[one],
+            organs,
+            state.noise,
+            share=state.share,
+            outlier_density=outliers,
+            organ=organ,
+            facing=state.facing,
         )
         np.testing.assert_allclose(np.exp(likelihood.evaluate(state).log_p[one]), expected, rtol=1e-8)
 
@@ -548,11 +576,11 @@ def test_an_extended_state_has_the_same_organs(thick):
 @pytest.mark.parametrize("cut", [True, False])
 def test_a_start_lies_within_the_bounds(thick, cut):
     """All of a leaf is seen, and it has no thickness unless it may."""
-    likelihood, state = scene(SHAPED, 15, thick=thick, cut=cut)
+    likelihood, state = scene(SHAPED, 15, thick=thick, cut=cut, one_sided=False)
     assert np.all((state.theta >= likelihood.lower) & (state.theta <= likelihood.upper))
     np.testing.assert_array_equal(state.x, SHAPED)
     np.testing.assert_allclose(state.noise[:2], 0.4, rtol=EXACT)
     assert state.seen == 1.0
     fixed = np.flatnonzero(likelihood.lower == likelihood.upper)
-    assert set(fixed) == ({N} if not cut else set()) | ({N + 9} if not thick else set())
+    assert set(fixed) == ({N} if not cut else set()) | ({N + 11} if not thick else set()) | {N + 7, N + 8}
     assert (state.noise[2] > 0.01) == thick

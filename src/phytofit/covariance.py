@@ -22,7 +22,7 @@ def covariance_of(
     at: Evaluation,
     dependence: Dependence,
 ) -> tuple[FloatArray, float]:
-    """Covariance (k + 12, k + 12) of the error of the maximum of a posterior, and how many independent points are left
+    """Covariance (k + 14, k + 14) of the error of the maximum of a posterior, and how many independent points are left
     for it after the fit.
 
     A sandwich: that of independent points, what neighbours share, and what is not known of holes.  An entry that its

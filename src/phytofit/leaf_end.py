@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from phytofit.flags import across_leaf
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import move
 
@@ -22,6 +21,7 @@ SHARPER = (0.4, 0.65, 1.0)  # times the noise of the whole leaf, which has its m
 N_ENDS = 17  # that are weighed, twice: all that may be, and those that turn out to be probable
 NODES, SHARES = np.sqrt(3.0) * np.array([0.0, 1.0, -1.0]), np.array([4.0, 1.0, 1.0]) / 6.0  # Gauss-Hermite
 NEAREST_END, FARTHEST = 0.3, 1.5  # of the way from the first to the last of these points
+BEYOND, NEAR = 1.1, 2.0  # of the length, to which it is continued; noise levels within which points are its
 N_STEPS, ACROSS, LEAST_SEEN = 60, (-0.6, 0.0, 0.6), 0.02  # along the strip; places across; share seen, at least
 STEP = 1e-4  # for derivatives of the tip
 MISFIT = 0.018  # of the length, by which the model's end is off, of real leaves: benchmarks/leaf_ends.py
@@ -37,7 +37,7 @@ class PointsEnd(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """``share`` of the fitted midrib at which the leaf ends, and by how much (k + 12, k + 12) to know that has
+    """``share`` of the fitted midrib at which the leaf ends, and by how much (k + 14, k + 14) to know that has
     ``changed`` the covariance of what was fitted."""
 
     share: float
@@ -70,11 +70,8 @@ def points_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     ----------
     scores : (n, k) of the points, as the state gives them
     """
-    on_leaf = state.belongs(scores)[1] > 0.5
-    place, across = across_leaf(likelihood, state)
-    length = float(likelihood.model.organs(state.x)[1].row(0).segment_lengths.sum())
     noise = float(state.noise[1])
-    at = place[on_leaf] * length
+    length, at, across = _near_leaf(likelihood, state, scores)
     if len(at) < LEAST_DECIDE:
         return None
     last = float(at.max())
@@ -83,7 +80,7 @@ def points_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     there = at > start
     if np.count_nonzero(there) < LEAST_DECIDE:
         return None
-    along, lateral = (at[there] - start) / noise, across[on_leaf, 0][there] / noise  # in units of the noise
+    along, lateral = (at[there] - start) / noise, across[there] / noise  # in units of the noise
     lateral -= np.median(lateral)
     far = float(along.max())
     step = FARTHEST * far / N_STEPS
@@ -100,9 +97,29 @@ def points_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     return PointsEnd(start + middle * noise, spread * noise)
 
 
+def _near_leaf(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    """Length of the fitted midrib, and places (n,) along it and sideways, cm, of the leaf's points, and of those near
+    to its straight continuation, where the fitted leaf has none."""
+    pose = likelihood.pose_of(state)
+    points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]
+    leaf = likelihood.model.organs(state.x)[1].row(0)
+    length = float(leaf.segment_lengths.sum())
+    longer = leaf.until(BEYOND)
+    piece, along = longer.nearest(points)
+    offset = points - longer.axis[piece]
+    sideways, off = (np.einsum("ni,ni->n", offset, longer.frame[piece][:, :, a]) for a in (1, 2))
+    last = piece == len(longer.frame) - 1
+    along = np.where(last, np.einsum("ni,ni->n", offset, longer.frame[piece][:, :, 0]), along)
+    at = np.append(0.0, np.cumsum(longer.segment_lengths))[piece] + along
+    box = (np.abs(sideways) < NEAR * state.noise[1]) & (np.abs(off) < NEAR * np.hypot(state.noise[1], state.noise[2]))
+    beyond = (at > length) & (at < BEYOND * length) & box & (likelihood.organ != 0)
+    theirs = (state.belongs(scores)[1] > 0.5) | beyond
+    return length, at[theirs], sideways[theirs]
+
+
 def _of_strips(ends: FloatArray, along: FloatArray, lateral: FloatArray, steps: _Steps) -> FloatArray:
-    """Log posterior (e, s, p, w) of strips of `ends` (e,), noise, powers and widths; places of points (n,) in units of
-    the noise."""
+    """Log probability (e, s, p, w) of the points on strips of `ends` (e,), noise, powers and widths; places (n,) in
+    units of the noise."""
     fits = np.empty((len(ends), len(SHARPER), len(POWERS), len(WIDTHS)))
     for k, noise in enumerate(SHARPER):
         places, sideways = along[:, np.newaxis] + noise * NODES, lateral[:, np.newaxis]  # where points may come from
@@ -116,8 +133,6 @@ def _of_strips(ends: FloatArray, along: FloatArray, lateral: FloatArray, steps: 
                 inside = (ndtr((edge + sideways) / noise) - ndtr((sideways - edge) / noise)) @ SHARES
                 density = inside / (2.0 * half[:, :, 0] * steps.expected(end, power).sum())
                 fits[i, k, j] = np.log(density + STRAY).sum(axis=1)
-    fits -= 0.5 * (np.log(POWERS)[:, np.newaxis] / POWER_SPREAD) ** 2
-    fits += 2.0 * np.log(SHARPER)[:, np.newaxis, np.newaxis]
     return fits
 
 
@@ -147,8 +162,10 @@ def _seen_along(likelihood: CloudLikelihood, state: State, at: FloatArray) -> Fl
 
 
 def _median_and_spread(ends: FloatArray, fits: FloatArray) -> tuple[float, float]:
-    """Median and standard deviation of the end, of the log posterior (e, s, p, w) on an even grid."""
-    weight = np.exp(fits - fits.max()).sum(axis=(1, 2, 3))
+    """Median and standard deviation of the end, of log probabilities (e, s, p, w) of the points on an even grid."""
+    posterior = fits - 0.5 * (np.log(POWERS)[:, np.newaxis] / POWER_SPREAD) ** 2
+    posterior += 2.0 * np.log(SHARPER)[:, np.newaxis, np.newaxis]
+    weight = np.exp(posterior - posterior.max()).sum(axis=(1, 2, 3))
     weight /= weight.sum()
     spread = np.sqrt(max(0.0, float(weight @ ends**2 - (weight @ ends) ** 2)))
     return float(np.interp(0.5, np.cumsum(weight) - 0.5 * weight, ends)), float(spread)
@@ -168,29 +185,28 @@ def combined(end: float, error: float, told: PointsEnd) -> tuple[float, float]:
 
 def ending(
     likelihood: CloudLikelihood, state: State, scores: FloatArray, covariance: FloatArray, shared_cm: float = 0.0
-) -> Ending | None:
-    """Where the leaf ends, by its model and by its last points; None where these are too few to tell.
+) -> Ending:
+    """Where the leaf ends, by its model and, where they are enough to tell, by its last points.
 
     Parameters
     ----------
-    scores : (n, k + 12) of the points, as the state gives them
-    covariance : (k + 12, k + 12) of the error of what was fitted
+    scores : (n, k + 14) of the points, as the state gives them
+    covariance : (k + 14, k + 14) of the error of what was fitted
     shared_cm : error that the last points have in common
     """
     told = points_end(likelihood, state, scores)
-    if told is None:
-        return None
-    told = told._replace(error=float(np.hypot(told.error, shared_cm)))
     moved = _tip_moved(likelihood, state)
     of_tip = covariance @ moved
     error = float(np.sqrt(max(float(moved @ of_tip), 1e-12)))
     length = float(likelihood.model.organs(state.x)[1].row(0).segment_lengths.sum())
-    end, left = combined(length, float(np.hypot(error, MISFIT * length)), told)
+    end, left = length, float(np.hypot(error, MISFIT * length))
+    if told is not None:
+        end, left = combined(end, left, told._replace(error=float(np.hypot(told.error, shared_cm))))
     return Ending(end / length, (left**2 - error**2) / error**4 * np.outer(of_tip, of_tip))
 
 
 def _tip_moved(likelihood: CloudLikelihood, state: State) -> FloatArray:
-    """How far (k + 12,) the fitted leaf's tip moves on, along its midrib, with each entry of theta."""
+    """How far (k + 14,) the fitted leaf's tip moves on, along its midrib, with each entry of theta."""
 
     def tip(theta: FloatArray) -> FloatArray:
         there = likelihood.with_theta(state, theta)

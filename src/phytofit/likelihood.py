@@ -18,8 +18,9 @@ from phytofit.parameters import ParameterSpace
 __all__ = ["LEAF_NOISE", "NOISE", "OUTLIERS", "SHARES", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 
 FloatArray = NDArray[np.float64]
-N_EXTRA = 12  # entries of theta after the model's parameters, see State
-NOISE, LEAF_NOISE, THICKNESS, SHARES, OUTLIERS = slice(-5, -3), -4, -3, slice(-2, None), -1  # their places in theta
+N_EXTRA = 14  # entries of theta after the model's parameters, see State
+TURN, SHIFT, FACING = slice(-13, -10), slice(-10, -7), slice(-7, -5)  # their places in theta
+NOISE, LEAF_NOISE, THICKNESS, SHARES, OUTLIERS = slice(-5, -3), -4, -3, slice(-2, None), -1
 NO_THICKNESS_CM = 1e-6
 LEAST_NOISE_CM = 0.05  # a midrib of straight pieces lies up to 0.02 cm off a curved one
 LEAST_SEEN, SEEN_SPREAD = 0.3, 0.3  # of the midrib: bound, and the prior's spread below 1
@@ -27,6 +28,7 @@ BLOCK = 500  # points that a thread takes at a time
 STEP = 1e-4  # of a prior's spread, for the derivatives of the organs
 POSE_STEP = 1e-4  # cm and radians, for those of the area that was seen
 NOISE_CM, NOISE_FACTOR = 0.3, 3.0  # of a surface's points: the prior's middle, and one spread of it
+FACING_SPREAD, MOST_FACING = 1.0, 2.5  # of the concentrations around the stem: the prior's spread, and bound
 SHARE_SPREAD = 2.5  # of the logits of the shares
 STEM_SHARE, OUTLIER_SHARE = 0.3, 0.03  # before a cloud is seen; the rest is the leaf's
 MOST_OUTLIERS = np.log(4.0)  # bound of logit_outlier
@@ -36,9 +38,10 @@ MOST_OUTLIERS = np.log(4.0)  # bound of logit_outlier
 class State:
     """A phytomer in a cloud.
 
-    ``theta`` (k + 12,) are the model's k parameters, the share of the midrib that was seen, from its start (1 unless
-    the tip is missing), a turn (rotation vector, radians) and a shift (cm) of the pose, logarithms of the noise on
-    stem and leaf and of the leaf's thickness (cm), logits of the shares of stem and outliers (relative to the leaf's).
+    ``theta`` (k + 14,) are the model's k parameters, the share of the midrib that was seen, from its start (1 unless
+    the tip is missing), a turn (rotation vector, radians) and a shift (cm) of the pose, the side that the stem's points
+    face (von Mises concentration, in the frame across it), logarithms of the noise on stem and leaf and of the leaf's
+    thickness (cm), logits of the shares of stem and outliers (relative to the leaf's).
     ``pose`` (4, 4) is the pose before it is turned about ``center`` (3,) and shifted.
     """
 
@@ -64,12 +67,17 @@ class State:
     @property
     def turn(self) -> FloatArray:
         """Rotation vector (3,), radians."""
-        return self.theta[-11:-8]
+        return self.theta[TURN]
 
     @property
     def shift(self) -> FloatArray:
         """(3,) cm."""
-        return self.theta[-8:-5]
+        return self.theta[SHIFT]
+
+    @property
+    def facing(self) -> FloatArray:
+        """(2,) concentration of the stem's points around it."""
+        return self.theta[FACING]
 
     @property
     def noise(self) -> FloatArray:
@@ -77,7 +85,7 @@ class State:
         return np.exp(self.theta[-5:-2])
 
     def belongs(self, scores: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Probabilities (n,) of points to be of the stem, of the leaf, or outliers; scores (n, k + 12) as this state
+        """Probabilities (n,) of points to be of the stem, of the leaf, or outliers; scores (n, k + 14) as this state
         gives them."""
         on_stem, outlier = scores[:, -2] + self.share[0], scores[:, -1] + self.share[2]
         return on_stem, 1.0 - on_stem - outlier, outlier
@@ -144,13 +152,30 @@ class CloudLikelihood:
         self._executor = executor
         inside = 1.0 - STEM_SHARE - OUTLIER_SHARE
         shares = [np.log(STEM_SHARE / inside), np.log(OUTLIER_SHARE / inside)]
-        self.mean = np.array([*space.mean, 1.0, *[0.0] * 6, *[np.log(NOISE_CM)] * 3, *shares])
-        self.std = np.array([*space.std, SEEN_SPREAD, *[np.inf] * 6, *[np.log(NOISE_FACTOR)] * 3, *[SHARE_SPREAD] * 2])
+        self.mean = np.array([*space.mean, 1.0, *[0.0] * 8, *[np.log(NOISE_CM)] * 3, *shares])
+        self.std = np.array(
+            [
+                *space.std,
+                SEEN_SPREAD,
+                *[np.inf] * 6,
+                *[FACING_SPREAD] * 2,
+                *[np.log(NOISE_FACTOR)] * 3,
+                *[SHARE_SPREAD] * 2,
+            ]
+        )
         self.precision = self.std**-2.0
         self.lower = np.array(
-            [*space.lower, LEAST_SEEN, *[-np.inf] * 6, *[np.log(LEAST_NOISE_CM)] * 2, np.log(0.005), *[-9.0] * 2]
+            [
+                *space.lower,
+                LEAST_SEEN,
+                *[-np.inf] * 6,
+                *[0.0] * 2,
+                *[np.log(LEAST_NOISE_CM)] * 2,
+                np.log(0.005),
+                *[-9.0] * 2,
+            ]
         )
-        self.upper = np.array([*space.upper, 1.0, *[np.inf] * 6, *[np.log(5.0)] * 3, 5.0, MOST_OUTLIERS])
+        self.upper = np.array([*space.upper, 1.0, *[np.inf] * 6, *[0.0] * 2, *[np.log(5.0)] * 3, 5.0, MOST_OUTLIERS])
         if not thick:
             self.mean[THICKNESS] = self.lower[THICKNESS] = self.upper[THICKNESS] = np.log(NO_THICKNESS_CM)
         if not cut:
@@ -194,10 +219,17 @@ class CloudLikelihood:
         return part
 
     def holding(self, state: State, held: NDArray[np.bool_]) -> "CloudLikelihood":
-        """The same likelihood, with entries of theta `held` (k + 12,) where the state has them."""
+        """The same likelihood, with entries of theta `held` (k + 14,) where the state has them."""
         other = copy.copy(self)
         other.lower = np.where(held, state.theta, self.lower)
         other.upper = np.where(held, state.theta, self.upper)
+        return other
+
+    def one_sided(self) -> "CloudLikelihood":
+        """The same likelihood, of a stem that may have been seen from one side."""
+        other = copy.copy(self)
+        other.lower, other.upper = self.lower.copy(), self.upper.copy()
+        other.lower[FACING], other.upper[FACING] = -MOST_FACING, MOST_FACING
         return other
 
     def _seen_at(self, points: FloatArray) -> FloatArray:
@@ -208,11 +240,11 @@ class CloudLikelihood:
 
     @property
     def free(self) -> NDArray[np.bool_]:
-        """Which entries (k + 12,) of theta are not held fixed."""
+        """Which entries (k + 14,) of theta are not held fixed."""
         return self.lower < self.upper
 
     def gradient(self, state: State, at: Evaluation) -> FloatArray:
-        """Derivatives (k + 12,) of the error, where the state was evaluated."""
+        """Derivatives (k + 14,) of the error, where the state was evaluated."""
         of_points = at.scores.sum(axis=0) if self.weights is None else self.weights @ at.scores
         gradient: FloatArray = (state.theta - self.mean) * self.precision - of_points
         return gradient
@@ -253,7 +285,7 @@ class CloudLikelihood:
         return float(area[0]), change
 
     def evaluate(self, state: State, *, derivatives: bool = True) -> Evaluation:
-        """The error and, if wanted, the scores (n, k + 12) of a state."""
+        """The error and, if wanted, the scores (n, k + 14) of a state."""
         k = len(self.space)
         n_steps = k + 1 if derivatives else 0
         columns = np.repeat(state.theta[np.newaxis, : k + 1], 2 * n_steps + 1, axis=0)
@@ -286,7 +318,7 @@ class CloudLikelihood:
             leaf_area_change,
             stem.axis[0, :-1] @ r.T + t, r @ stem.frame[0], stem_length[0], radius[0], stem_change,
             stem_area_change,
-            state.noise, state.share, self.outlier_density,
+            state.facing, state.noise, state.share, self.outlier_density,
         )  # fmt: skip
 
         def block(first: int) -> None:

@@ -99,11 +99,9 @@ def outcome(chosen: Chosen, history: tuple[Generation, ...], *, dithered: bool) 
         covariance = mixed(covariance, there, other.state.theta - state.theta, p)
     seen = sighting(likelihood, state, at.scores)
     too_long = state.seen == 1.0 and seen.short > EXPECTED_BEYOND * dependence.inflation
-    ends = None
+    ends = Ending(1.0, np.zeros_like(covariance))
     if state.seen == 1.0 and (too_long or TAPER in likelihood.space.names):
         ends = ending(likelihood, state, at.scores, covariance, shared_by_neighbors(dependence, state.noise))
-    if ends is None:
-        ends = Ending(seen.end if too_long else 1.0, np.zeros_like(covariance))
     x, covariance, converged = _with_width_of_whole_pieces(end, dependence, covariance[:k, :k])
     return Estimate(
         x=x,

@@ -37,11 +37,12 @@ DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its twelve parameters gain six by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
-CLEARLY_BETTER = 5.0  # nats, by which another beginning of a richer leaf must fit better
+CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning, or is known of the stem, must fit better
 ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
 LOWER_ROUNDS = 3
+LEAST_FACING = 1.0  # concentration, from which a stem was seen from one side: a half of it has 1.6
 
 
 def estimate(
@@ -95,7 +96,7 @@ def estimate(
     registration, _ = objective.register(search.mean)
     cloud = Cloud(points, organ, executor)
     state = _drawn_in(plain, cloud, [(search.mean, registration.T_target_source), *starts])
-    chosen = _at_surface(species, _choice(_candidates(plain, species, cloud, state)))
+    chosen = _at_surface(species, _one_sided(_choice(_candidates(plain, species, cloud, state))))
     return outcome(chosen, tuple(search.history), dithered=points is not given)
 
 
@@ -208,6 +209,20 @@ def _choice(found: Sequence[End]) -> Chosen:
         dependence = score_dependence(found[best].likelihood, found[best].state, dependence)
     doubtful = best % 2 == 0 and gains[best] > TIP_DOUBTFUL
     return Chosen(found[best], evidence[best], dependence, doubtful, blunt, rival)
+
+
+def _one_sided(chosen: Chosen) -> Chosen:
+    """Of a stem that was seen from one side, the fit that knows it, where that is clearly so."""
+    free = chosen.end.likelihood.one_sided()
+    refined = refinement(free, chosen.end.state)
+    there = free.with_theta(chosen.end.state, refined.theta)
+    if np.linalg.norm(there.facing) < LEAST_FACING:
+        return chosen
+    end = End(free, there, free.evaluate(there), refined.converged)
+    lead = evidence_of(end, chosen.dependence.inflation) - evidence_of(chosen.end, chosen.dependence.inflation)
+    if lead < CLEARLY_BETTER:
+        return chosen
+    return chosen._replace(end=end, evidence=chosen.evidence + lead, dependence=score_dependence(free, there))
 
 
 def _at_surface(species: Species, chosen: Chosen) -> Chosen:

@@ -117,7 +117,10 @@ def _leaf(stem: Organ, leaf: Organ, chord_cm: float) -> list[tuple[str, float, s
         angle = _angle(end - base, up)
         insertion = _angle(leaf.axis[segment + 1] - leaf.axis[segment], up)
         tangent = np.diff(leaf.axis[segment:], axis=0)
-        turning = sum(_angle(a, b) for a, b in pairwise(tangent))
+        turns = [_angle(a, b) for a, b in pairwise(tangent)]
+        if turns:  # a leaf that was cut in the last piece has not turned all the way
+            turns[-1] *= min(1.0, float(np.linalg.norm(tangent[-1]) / np.linalg.norm(tangent[-2])))
+        turning = sum(turns)
         curvature = turning / length
         at = np.concatenate([[start], node_at[node_at > start]])
         half = np.interp(at, node_at, leaf.half_width)

@@ -84,14 +84,16 @@ def log_density(
     points, organ, seen,
     leaf_origin, leaf_frame, leaf_length, leaf_half, leaf_area, leaf_change, leaf_area_change,
     stem_origin, stem_frame, stem_length, stem_radius, stem_change, stem_area_change,
-    noise, share, outlier_density,
+    facing, noise, share, outlier_density,
     log_p, scores,
 ):  # fmt: skip
     """Log density of points, each from the stem's surface, the leaf's, or an outlier, and its derivatives.
 
-    A point of an organ is uniform on its surface, displaced by isotropic normal noise.  For a flat patch its density
-    is a normal density across it times differences of error functions along and across; for a tube, a ring blurred by
-    noise (a Rice density: Bessel function I0) times such a difference along the axis.
+    A point of an organ is uniform on its surface, displaced by isotropic normal noise; but around a tube, which may
+    have been seen from one side, its angle has a von Mises density.  For a flat patch the density is a normal density
+    across it times differences of error functions along and across; for a tube, a ring blurred by noise times such a
+    difference along the axis.  With R the radius, s the noise and p the place across the axis, the ring's is
+    exp(-(p² + R²) / 2 s²) I0(|R p / s² + facing|) / (2 pi s² I0(|facing|)): a Rice density where it faces nowhere.
 
     Parameters
     ----------
@@ -106,12 +108,14 @@ def log_density(
     leaf_change (m, 9, k), leaf_area_change (k,), stem_change (s, 9, k), stem_area_change (k,) : change of a segment,
         in its own frame, and of the logarithm of the organ's area, for a unit change of each
         of k parameters
+    facing : (2,) von Mises concentration of the stem's points, towards a side, in the frame across it
     noise : (3,) standard deviation: on the stem; on the leaf; and what its thickness adds to that across the blade
     share : (3,) of the points: stem, leaf, outliers
     outlier_density : of an outlier, per volume
     log_p : (n,), filled with the log density
-    scores : (n, k + 5), filled with its derivatives by the k parameters, by the logarithms of the three noises, and by
-        the logits of the shares of stem and outliers (relative to the leaf's); or (0, 0): not wanted
+    scores : (n, k + 7), filled with its derivatives by the k parameters, by what the stem faces, by the logarithms of
+        the three noises, and by the logits of the shares of stem and outliers (relative to the leaf's); or (0, 0): not
+        wanted
     """
     n = points.shape[0]
     m = leaf_origin.shape[0]
@@ -125,11 +129,15 @@ def log_density(
     for j in range(len(stem_length)):
         stem_area += stem_length[j] * stem_radius[j]
     floor = share[2] * outlier_density
+    facing_v, facing_w = facing[0], facing[1]
+    one_sided = np.sqrt(facing_v * facing_v + facing_w * facing_w)
+    at_all_sides, mean_facing = _bessel(one_sided)
+    mean_facing = mean_facing / one_sided if one_sided > 0.0 else 0.5
     for i in range(n):
         on_stem = 0.0
         on_leaf = 0.0
         if wanted:
-            for c in range(k + 5):
+            for c in range(k + 7):
                 scores[i, c] = 0.0
         if organ[i] != 1:
             for j in range(len(stem_length)):
@@ -152,9 +160,13 @@ def log_density(
                 along = from_foot - from_top
                 if along <= 0.0:
                     continue
-                bessel, ratio = _bessel(rho * radius / stem_square)
+                pull_v, pull_w = radius * v / stem_square + facing_v, radius * w / stem_square + facing_w
+                pull = np.sqrt(pull_v * pull_v + pull_w * pull_w)
+                bessel, ratio = _bessel(pull)
+                ratio = ratio / pull if pull > 0.0 else 0.5
                 gap = rho - radius
-                around = np.exp(-0.5 * gap * gap / stem_square) * bessel / (2.0 * np.pi * stem_square)
+                exponent = pull - rho * radius / stem_square - one_sided - 0.5 * gap * gap / stem_square
+                around = np.exp(exponent) * bessel / (2.0 * np.pi * stem_square * at_all_sides)
                 density = share[0] * radius / stem_area * around * along
                 if density <= 0.0:
                     continue
@@ -164,10 +176,10 @@ def log_density(
                     at_top /= stem_noise * along
                     by_u = density * (at_foot - at_top)
                     by_length = density * at_top
-                    by_rho = density * (radius * ratio - rho) / stem_square
-                    by_half = 0.5 * density * ((rho * ratio - radius) / stem_square + 1.0 / radius)
-                    by_v = by_rho * v / rho if rho > 0.0 else 0.0
-                    by_w = by_rho * w / rho if rho > 0.0 else 0.0
+                    towards = ratio * (pull_v * v + pull_w * w)
+                    by_half = 0.5 * density * ((towards - radius) / stem_square + 1.0 / radius)
+                    by_v = density * (radius * ratio * pull_v - v) / stem_square
+                    by_w = density * (radius * ratio * pull_w - w) / stem_square
                     change = stem_change[j]
                     for c in range(k):
                         scores[i, c] += (
@@ -177,9 +189,11 @@ def log_density(
                             - by_v * (change[1, c] + change[5, c] * u - change[3, c] * w)
                             - by_w * (change[2, c] + change[3, c] * v - change[4, c] * u)
                         )
-                    scores[i, k] += density * (
+                    scores[i, k] += density * (ratio * pull_v - mean_facing * facing_v)
+                    scores[i, k + 1] += density * (ratio * pull_w - mean_facing * facing_w)
+                    scores[i, k + 2] += density * (
                         -2.0
-                        + (rho * rho + radius * radius - 2.0 * rho * radius * ratio) / stem_square
+                        + (rho * rho + radius * radius - 2.0 * radius * towards) / stem_square
                         - (u * at_foot - (u - length) * at_top)
                     )
         if organ[i] != 0:
@@ -251,18 +265,17 @@ def log_density(
                             - by_v * (change[1, c] + change[5, c] * u - change[3, c] * w)
                             - by_w * (change[2, c] + change[3, c] * v - change[4, c] * u)
                         )
-                    scores[i, k + 1] += density * by_noise
-                    scores[i, k + 2] += density * (1.0 - thin) * by_thickness
+                    scores[i, k + 3] += density * by_noise
+                    scores[i, k + 4] += density * (1.0 - thin) * by_thickness
         p = floor + on_stem + on_leaf
         log_p[i] = np.log(p)
         if wanted:
             for c in range(k):
                 scores[i, c] = (scores[i, c] - on_leaf * leaf_area_change[c] - on_stem * stem_area_change[c]) / p
-            scores[i, k] /= p
-            scores[i, k + 1] /= p
-            scores[i, k + 2] /= p
-            scores[i, k + 3] = on_stem / p - share[0]
-            scores[i, k + 4] = floor / p - share[2]
+            for c in range(k, k + 5):
+                scores[i, c] /= p
+            scores[i, k + 5] = on_stem / p - share[0]
+            scores[i, k + 6] = floor / p - share[2]
 
 
 @kernel

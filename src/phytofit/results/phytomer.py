@@ -111,6 +111,7 @@ def _how_it_ended(result: Fit) -> dict[str, Any]:
         "evidence": made.evidence,
         "variance_inflation": made.inflation,
         "covariance": result.covariance.tolist(),
+        "trait_covariance": None if result.trait_covariance is None else result.trait_covariance.tolist(),
     }
 
 
