@@ -13,15 +13,16 @@ from phytofit.flags import across_leaf
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.species import Species
 
-__all__ = ["along_points", "lower_insertion", "turned_blade"]
+__all__ = ["along_points", "longer_leaf", "lower_insertion", "turned_blade"]
 
 FloatArray = NDArray[np.float64]
 TURNED = 30.0  # degrees, from which a blade is also begun turned
 LEAST_ACROSS = 20  # points that say how a half of it lies
 LOWER, LEAST_LOWER_CM = 0.12, 2.0  # of the leaf's length, by which its insertion is also tried lower down
 PRIOR_CM = 0.2  # by which its midrib may be moved to make it a spread of the prior more plausible
+LEFT_OVER, LONGER = 0.005, (1.12, 1.3)  # share of outliers; times the leaf's length, as which it is begun
 N_WALKED, NEIGHBORS, LINK = 1500, 10, 3.0  # points of the leaf; neighbours; typical distances that link two of them
-N_BANDS, LEAST_IN_BAND = 25, 5  # of equal distance from the stem, along the leaf; points
+N_BANDS, IN_BAND, LEAST_IN_BAND = 25, 8, 5  # of equal distance from the stem, along the leaf; points wanted, needed
 STRAY, TIP_OFF = 1.0, 0.05  # half widths off the midrib; of the leaf's length: so far off its points' line may be
 SIDEWAYS = ("leaf_side_bend", "leaf_side_bow")
 BENT = ("leaf_angle", "leaf_length", "leaf_rotate_angle", "leaf_bow", "leaf_wave", "leaf_base_bend")
@@ -74,6 +75,17 @@ def lower_insertion(species: Species, state: State) -> Iterator[State]:
     yield _with_x(state, _following(species, other, bent, there, from_tip))
 
 
+def longer_leaf(state: State) -> Iterator[State]:
+    """The state with a longer leaf that goes on bending, where points are left over: some of them may be its tip's, too
+    few and too far away to draw it on."""
+    if state.share[2] < LEFT_OVER:
+        return
+    for times in LONGER:
+        theta = state.theta.copy()
+        theta[[3, 5]] *= times  # the bend is a thirtieth of the leaf's
+        yield State(theta, state.pose, state.center)
+
+
 def along_points(species: Species, likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Iterator[State]:
     """The state with a midrib that follows the leaf's points from the stem to their end, where it now leaves them: what
     a leaf that bends sharply, or curls back, needs."""
@@ -114,9 +126,10 @@ def _line_of(points: FloatArray, state: State) -> tuple[FloatArray, FloatArray]:
     rest = np.hypot(points[:, 0], points[:, 1])
     first = np.flatnonzero(largest)[np.argsort(rest[largest])[:NEIGHBORS]]
     walked = dijkstra(graph, directed=False, indices=first, min_only=True)
-    band = np.where(largest, walked / walked[largest].max() * (N_BANDS - 1e-9), -1.0).astype(int)
-    enough = [b for b in range(N_BANDS) if np.count_nonzero(band == b) >= LEAST_IN_BAND]
-    if len(enough) < N_BANDS // 2:
+    n_bands = min(N_BANDS, np.count_nonzero(largest) // IN_BAND)
+    band = np.where(largest, walked / walked[largest].max() * (n_bands - 1e-9), -1.0).astype(int)
+    enough = [b for b in range(n_bands) if np.count_nonzero(band == b) >= LEAST_IN_BAND]
+    if len(enough) < max(3, n_bands // 2):
         return nothing
     line = np.stack([points[band == b].mean(axis=0) for b in enough])
     line[1:-1] = 0.25 * line[:-2] + 0.5 * line[1:-1] + 0.25 * line[2:]

@@ -21,6 +21,7 @@ TYPICAL = 0.75  # quantile of the numbers of points on parts of the leaf that co
 CLEARLY = 4.0  # standard deviations of the number of points
 NEAR_TIP, FEW_BEYOND, N_BEYOND = 0.15, 12, 4000  # of the leaf's length; points; points drawn around the tip
 N_STRIPS = 3  # of the blade, in which gaps are counted
+FEW_FOR_SHAPE = 200.0  # points, fewer than which tell little of a leaf with a shape of its own
 N_SECTORS = 12  # around the stem
 ROUND = 0.7  # share of them that must be seen
 BASE_SECTIONS = 2  # the leaf's first tenth
@@ -54,7 +55,7 @@ class Sighting:
     other parts have; ``beyond`` number of points near the leaf's tip that are of no organ, 0 if there are not more than
     by chance; ``end`` share of the midrib at which the leaf's last point lies, and ``short`` how many more would be
     expected beyond it; ``along_stem`` cm of the midrib that lie inside the stem, but so near its surface that they may
-    as well be outside.
+    as well be outside; ``leaf_points`` number of points on the leaf.
     """
 
     sections: FloatArray
@@ -65,6 +66,7 @@ class Sighting:
     end: float
     short: float
     along_stem: float = 0.0
+    leaf_points: float = np.inf
 
     @property
     def leaf(self) -> float:
@@ -91,7 +93,17 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
     end = float(across_leaf(likelihood, state)[0][on_leaf > 0.5].max(initial=0.0))
     short = float(on_leaf.sum() * (1.0 - place[on_leaf > 0.5].max(initial=0.0)))
     risen = along_stem(likelihood, state)
-    return Sighting(found / typical, float(on_stem.sum()), float(shown), gaps, float(beyond), end, short, risen)
+    return Sighting(
+        found / typical,
+        float(on_stem.sum()),
+        float(shown),
+        gaps,
+        float(beyond),
+        end,
+        short,
+        risen,
+        float(on_leaf.sum()),
+    )
 
 
 def along_stem(likelihood: CloudLikelihood, state: State) -> float:
@@ -208,7 +220,7 @@ def flags_of(
         yield TIP_DOUBTFUL
     if seen.beyond:
         yield BEYOND_TIP.format(seen.beyond)
-    yield from _of_what_was_seen(seen)
+    yield from _of_what_was_seen(seen, OFFSET in space.names)
     if seen.along_stem:
         yield ALONG_STEM.format(seen.along_stem * scale, _length_unit(scale))
     if outlier_share >= LITTLE_EXPLAINED:
@@ -225,13 +237,15 @@ def flags_of(
     yield from _against_the_prior(space, x, scale)
 
 
-def _of_what_was_seen(seen: Sighting) -> Iterator[str]:
+def _of_what_was_seen(seen: Sighting, own_shape: bool) -> Iterator[str]:
     if np.all(seen.sections[:BASE_SECTIONS] < SEEN_DENSITY):
         yield "the leaf's base is hidden: its angle is read off the rest of the leaf"
     if seen.leaf < 0.5:
         yield f"only {100 * seen.leaf:.0f} % of the leaf was seen"
     elif seen.gaps >= MANY_GAPS:
         yield f"{100 * seen.gaps:.0f} % of the blade has next to no points: its width rests on the rest, and may be off"
+    if seen.leaf_points < FEW_FOR_SHAPE and own_shape:
+        yield f"only {seen.leaf_points:.0f} points tell the leaf's shape: its length may be off by several cm"
     if seen.stem_points < FEW_ON_STEM:
         yield f"only {seen.stem_points:.0f} points on the stem"
     elif seen.sectors < ROUND:

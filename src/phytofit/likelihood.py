@@ -29,6 +29,7 @@ STEP = 1e-4  # of a prior's spread, for the derivatives of the organs
 POSE_STEP = 1e-4  # cm and radians, for those of the area that was seen
 NOISE_CM, NOISE_FACTOR = 0.3, 3.0  # of a surface's points: the prior's middle, and one spread of it
 FACING_SPREAD, MOST_FACING = 1.0, 2.5  # of the concentrations around the stem: the prior's spread, and bound
+SAME_NOISE = 1.3  # one spread of the leaf's noise about the stem's
 SHARE_SPREAD = 2.5  # of the logits of the shares
 STEM_SHARE, OUTLIER_SHARE = 0.3, 0.03  # before a cloud is seen; the rest is the leaf's
 MOST_OUTLIERS = np.log(4.0)  # bound of logit_outlier
@@ -125,6 +126,7 @@ class CloudLikelihood:
     thick : whether the leaf may have a thickness, which widens the noise across the blade
     cut : whether the leaf's tip may be missing
     hidden : where points of the leaf were not seen; None: nowhere
+    leaf_noise_cm : about that of the leaf's points, which few of them can't tell from its shape; None: not known
     """
 
     def __init__(
@@ -138,6 +140,7 @@ class CloudLikelihood:
         thick: bool = False,
         cut: bool = False,
         hidden: Hidden | None = None,
+        leaf_noise_cm: float | None = None,
         executor: Executor | None = None,
     ) -> None:
         self.model = model
@@ -163,6 +166,8 @@ class CloudLikelihood:
                 *[SHARE_SPREAD] * 2,
             ]
         )
+        if leaf_noise_cm is not None:
+            self.mean[LEAF_NOISE], self.std[LEAF_NOISE] = np.log(leaf_noise_cm), np.log(SAME_NOISE)
         self.precision = self.std**-2.0
         self.lower = np.array(
             [

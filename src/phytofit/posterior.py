@@ -11,7 +11,7 @@ from scipy.linalg import pinvh
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from phytofit.beginnings import along_points, lower_insertion, turned_blade
+from phytofit.beginnings import along_points, longer_leaf, lower_insertion, turned_blade
 from phytofit.dependence import score_dependence
 from phytofit.distances import Reference, chamfer
 from phytofit.flags import OFFSET, along_stem
@@ -145,6 +145,7 @@ def _candidates(plain: Species, species: Species, cloud: Cloud, state: State) ->
 def _rich(species: Species, cloud: Cloud, simple: End) -> tuple[End, End]:
     """With all parameters of the species, whole and with the tip missing: where the best of several beginnings leads
     to, which is found with a part of the points."""
+    cloud = cloud._replace(leaf_noise_cm=float(simple.state.noise[0]))
     part = cloud.part(FEW_POINTS)
     begun = [simple.state, *turned_blade(species, simple.likelihood, simple.state, simple.at.scores)]
     best = max((refined_end(species, it, part, thick=True) for it in begun), key=lambda end: end.fit_of_points)
@@ -164,6 +165,7 @@ def _elsewhere(species: Species, cloud: Cloud, best: End, rounds: int) -> End:
     """The best so far, or where a turned blade, a midrib along the points, or an insertion lower down leads to, if it
     fits better."""
     best = _better(species, cloud, best, turned_blade(species, best.likelihood, best.state, best.at.scores))
+    best = _better(species, cloud, best, longer_leaf(best.state))
     best = _better(species, cloud, best, along_points(species, best.likelihood, best.state, best.at.scores))
     for _ in range(rounds):
         lower = _better(species, cloud, best, lower_insertion(species, best.state))

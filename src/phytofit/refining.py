@@ -22,18 +22,20 @@ SAME_SHARE = 0.05
 
 
 class Cloud(NamedTuple):
-    """Points (n, 3), what their labels say (n,) or None, who works on them, and for how many each of them stands."""
+    """Points (n, 3), what their labels say (n,) or None, who works on them, for how many each of them stands, and the
+    noise of the leaf's, if something is known of it."""
 
     points: FloatArray
     organ: NDArray[np.int8] | None
     executor: Executor | None
     stride: int = 1
+    leaf_noise_cm: float | None = None
 
     def part(self, n: int) -> "Cloud":
         """Every so-many-th point, n or a little more, with the weight of those that it stands for."""
         stride = max(1, len(self.points) // n)
         organ = None if self.organ is None else self.organ[::stride]
-        return Cloud(self.points[::stride], organ, self.executor, self.stride * stride)
+        return self._replace(points=self.points[::stride], organ=organ, stride=self.stride * stride)
 
     def likelihood(self, species: Species, **settings: Any) -> CloudLikelihood:
         weights = None if self.stride == 1 else np.full(len(self.points), float(self.stride))
@@ -43,6 +45,7 @@ class Cloud(NamedTuple):
             self.points,
             organ=self.organ,
             weights=weights,
+            leaf_noise_cm=self.leaf_noise_cm,
             executor=self.executor,
             **settings,
         )
