@@ -1,9 +1,12 @@
 """Where a leaf ends: strips of known ends, holes before them, and what they do to the length and its interval."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import phytofit
+from phytofit.fitted import remarked
 from phytofit.hidden import N_STRIPS, Hidden
 from phytofit.leaf_end import MISFIT, PointsEnd, combined, ending, points_end
 from phytofit.likelihood import CloudLikelihood
@@ -186,3 +189,22 @@ def test_a_leaf_with_a_hollow_tip_has_its_own_length(seed):
     assert result.organs[1].segment_lengths.sum() == pytest.approx(
         result.estimate.ends_at * organ.segment_lengths.sum()
     )
+
+
+def test_only_a_leaf_that_is_clearly_too_long_is_called_cut_back():
+    made = phytofit.simulate(n_points=1500, noise_cm=0.3, seed=3)
+    result = phytofit.fit(made.points, "cm", threads=2)
+    for too_long in (True, False):
+        cut = replace(result, flags=(), estimate=replace(result.estimate, ends_at=0.9, too_long=too_long))
+        assert any("was cut back by 10 %" in flag for flag in remarked(cut).flags) == too_long
+
+
+def test_upside_down_the_leaf_ends_where_it_does():
+    """Seen upside down, the leaf is the same, and as certain."""
+    shape = {"leaf_side_bend": 30.0, "leaf_twist": 40.0, "leaf_base_width": 0.5, "leaf_taper": 1.0}
+    made = phytofit.simulate(fixed=FLAT | shape, n_points=2500, noise_cm=0.3, seed=3)
+    right, wrong = (phytofit.fit(made.points, "cm", up=sign * made.pose[:3, 2], threads=2) for sign in (1.0, -1.0))
+    assert len(right.x) > 7
+    assert np.abs(right.trait_covariance - right.covariance).max() > 0.0
+    one, other = (next(t for t in it.traits if t.name == "leaf_length") for it in (right, wrong))
+    assert (other.value, other.low, other.high) == pytest.approx((one.value, one.low, one.high), rel=1e-2)

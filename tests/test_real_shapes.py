@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import phytofit
-from phytofit.beginnings import along_points, lower_insertion, turned_blade
+from phytofit.beginnings import along_points, longer_leaf, lower_insertion, turned_blade
 from phytofit.models.organs import frames_along
 from phytofit.refining import Cloud, refined_end
 
@@ -273,3 +273,43 @@ def test_holes_hardly_widen_a_blade_and_many_are_flagged(nodes, radius, flagged)
     assert any("of the blade has next to no points" in flag for flag in result.flags) == flagged
     assert trait(result, "leaf_width").value == pytest.approx(6.0, abs=0.25)
     assert not any("of the blade" in flag for flag in fitted(made).flags)
+
+
+OWN = {"leaf_bow": 15.0, "leaf_side_bend": -20.0, "leaf_base_width": 0.5, "leaf_taper": 1.5, "leaf_twist": 30.0}
+
+
+def test_a_sparse_leaf_is_followed_to_its_tip_and_flagged():
+    """Some 150 points on it: the last of them are few, and far from what a short leaf would have."""
+    results = [fitted(grown(seed=seed, n_points=260, **OWN)) for seed in range(1, 8)]
+    for result in results:
+        assert len(result.x) > 7
+        assert result.estimate.noise[1] > 0.1
+        assert any("points tell the leaf's shape" in flag for flag in result.flags)
+    off = np.array([trait(result, "leaf_length").value - 55.0 for result in results])
+    assert np.median(np.abs(off)) < 2.5
+    assert np.sqrt(np.mean(off**2)) < 6.0
+
+
+def test_a_leaf_of_many_points_is_not_called_sparse():
+    assert not any("points tell the leaf's shape" in flag for flag in fitted(grown(**OWN)).flags)
+
+
+def test_a_longer_leaf_is_begun_only_where_points_are_left_over():
+    made = grown(**OWN)
+    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
+    state = likelihood.start(made.x, made.pose, 0.3)
+    longer = list(longer_leaf(state))
+    assert [it.x[3] / state.x[3] for it in longer] == pytest.approx([1.12, 1.3])
+    theta = state.theta.copy()
+    theta[-1] = -9.0
+    assert list(longer_leaf(likelihood.with_theta(state, theta))) == []
+
+
+@pytest.mark.parametrize("seed", [5000, 5007, 5021])
+def test_a_stem_that_one_camera_saw_keeps_its_diameter(seed):
+    """As a whole tube it would come out 0.7 cm too thin."""
+    made = phytofit.simulate(seed=seed, n_views=1)
+    result = phytofit.fit(made.points, "cm", threads=2)
+    true = next(t.value for t in phytofit.measure(made.organs) if t.name == "stem_diameter")
+    assert abs(trait(result, "stem_diameter").value - true) < 0.45
+    assert any("seen from one side" in flag for flag in result.flags)

@@ -126,7 +126,7 @@ def _line_of(points: FloatArray, state: State) -> tuple[FloatArray, FloatArray]:
     rest = np.hypot(points[:, 0], points[:, 1])
     first = np.flatnonzero(largest)[np.argsort(rest[largest])[:NEIGHBORS]]
     walked = dijkstra(graph, directed=False, indices=first, min_only=True)
-    n_bands = min(N_BANDS, np.count_nonzero(largest) // IN_BAND)
+    n_bands = min(N_BANDS, int(np.count_nonzero(largest)) // IN_BAND)
     band = np.where(largest, walked / walked[largest].max() * (n_bands - 1e-9), -1.0).astype(int)
     enough = [b for b in range(n_bands) if np.count_nonzero(band == b) >= LEAST_IN_BAND]
     if len(enough) < max(3, n_bands // 2):
