@@ -208,3 +208,14 @@ def test_upside_down_the_leaf_ends_where_it_does():
     assert np.abs(right.trait_covariance - right.covariance).max() > 0.0
     one, other = (next(t for t in it.traits if t.name == "leaf_length") for it in (right, wrong))
     assert (other.value, other.low, other.high) == pytest.approx((one.value, one.low, one.high), rel=1e-2)
+
+
+def test_a_leaf_that_ends_bluntly_may_lack_its_tip():
+    """What is left of a leaf of its own shape without its last fifth has no upper end, and a flag."""
+    shape = {"leaf_side_bend": 30.0, "leaf_twist": 60.0, "leaf_bow": 20.0, "leaf_base_width": 0.5, "leaf_taper": 1.0}
+    made = phytofit.simulate(fixed=FLAT | shape, n_points=5000, noise_cm=0.2, seed=7)
+    piece, _ = made.organs[1].nearest(made.points)
+    result = phytofit.fit(made.points[(made.labels == 1) | (piece < 24)], "cm", up=made.pose[:3, 2], threads=2)
+    assert len(result.x) > 7
+    assert not result.estimate.tip_seen
+    assert next(t for t in result.traits if t.name == "leaf_length").high is None

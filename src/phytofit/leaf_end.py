@@ -24,6 +24,7 @@ NEAREST_END, FARTHEST = 0.3, 1.5  # of the way from the first to the last of the
 BEYOND, NEAR = 1.1, 2.0  # of the length, to which it is continued; noise levels within which points are its
 N_STEPS, ACROSS, LEAST_SEEN = 60, (-0.6, 0.0, 0.6), 0.02  # along the strip; places across; share seen, at least
 STEP = 1e-4  # for derivatives of the tip
+CLEARLY = 2.0  # standard errors
 MISFIT = 0.018  # of the length, by which the model's end is off, of real leaves: benchmarks/leaf_ends.py
 N_BANDS = 8  # of as many expected points each, by which it is told how unevenly they lie
 STRAY = 1e-9  # density of points that the strip does not explain, in units of the noise
@@ -38,10 +39,11 @@ class PointsEnd(NamedTuple):
 
 class Ending(NamedTuple):
     """``share`` of the fitted midrib at which the leaf ends, and by how much (k + 14, k + 14) to know that has
-    ``changed`` the covariance of what was fitted."""
+    ``changed`` the covariance of what was fitted; whether it is ``clearly_shorter`` than the fitted leaf."""
 
     share: float
     changed: FloatArray
+    clearly_shorter: bool = False
 
 
 class _Steps(NamedTuple):
@@ -202,7 +204,8 @@ def ending(
     end, left = length, float(np.hypot(error, MISFIT * length))
     if told is not None:
         end, left = combined(end, left, told._replace(error=float(np.hypot(told.error, shared_cm))))
-    return Ending(end / length, (left**2 - error**2) / error**4 * np.outer(of_tip, of_tip))
+    changed = (left**2 - error**2) / error**4 * np.outer(of_tip, of_tip)
+    return Ending(end / length, changed, bool(length - end > CLEARLY * left))
 
 
 def _tip_moved(likelihood: CloudLikelihood, state: State) -> FloatArray:

@@ -13,12 +13,14 @@ from phytofit.flags import Sighting, sighting
 from phytofit.leaf_end import Ending, ending
 from phytofit.optimize import Generation
 from phytofit.refining import End, refinement
+from phytofit.tip import gain_of_blunt_end
 from phytofit.whole_pieces import of_whole_pieces
 
 __all__ = ["Chosen", "Elsewhere", "Estimate", "outcome"]
 
 FloatArray = NDArray[np.float64]
 EXPECTED_BEYOND = 7.0  # points that should lie beyond the last: of a whole leaf 1 in 1,100 has as many
+BLUNTLY = 5.0  # nats by which the last points must say that a leaf ends bluntly
 TAPER = "leaf_taper"  # of a leaf that has one of its own, its last points tell where it ends
 
 
@@ -102,6 +104,7 @@ def outcome(chosen: Chosen, history: tuple[Generation, ...], *, dithered: bool) 
     ends = Ending(1.0, np.zeros_like(covariance))
     if state.seen == 1.0 and (too_long or TAPER in likelihood.space.names):
         ends = ending(likelihood, state, at.scores, covariance, shared_by_neighbors(dependence, state.noise))
+    blunt = ends.clearly_shorter and (gain_of_blunt_end(likelihood, state, at.scores) > BLUNTLY * dependence.inflation)
     x, covariance, converged = _with_width_of_whole_pieces(end, dependence, covariance[:k, :k])
     return Estimate(
         x=x,
@@ -112,7 +115,7 @@ def outcome(chosen: Chosen, history: tuple[Generation, ...], *, dithered: bool) 
         noise=state.noise,
         share=state.share,
         seen=state.seen,
-        tip_seen=state.seen == 1.0 and not chosen.tip_doubtful and not seen.beyond and not too_long,
+        tip_seen=state.seen == 1.0 and not chosen.tip_doubtful and not seen.beyond and not too_long and not blunt,
         blunt=chosen.blunt,
         ends_at=ends.share,
         log_p=at.log_p,
