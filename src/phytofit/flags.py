@@ -172,15 +172,24 @@ def _beyond_tip(likelihood: CloudLikelihood, state: State, scores: FloatArray) -
     return len(there) if len(there) > expected + CLEARLY * np.sqrt(expected) else 0
 
 
-def across_leaf(likelihood: CloudLikelihood, state: State) -> tuple[FloatArray, FloatArray]:
-    """Share (n,) of the midrib at which each point lies, and where (n, 2) across it: cm sideways, and off the blade."""
+def across_leaf(
+    likelihood: CloudLikelihood, state: State, *, until: float | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Share (n,) of the midrib at which each point lies, and where (n, 2) across it: cm sideways, and off the blade.
+
+    With `until`, a share of more than 1, the midrib goes straight on so far, and beyond that.
+    """
     pose = likelihood.pose_of(state)
     points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]
     leaf = likelihood.model.organs(state.x)[1].row(0)
+    whole = leaf.segment_lengths.sum()
+    leaf = leaf if until is None else leaf.until(until)
     j, along = leaf.nearest(points)
-    lengths = leaf.segment_lengths
-    place = (np.concatenate([[0.0], np.cumsum(lengths)])[j] + along) / lengths.sum()
-    return place, np.einsum("nib,ni->nb", leaf.frame[j][:, :, 1:], points - leaf.axis[j])
+    there = np.einsum("nib,ni->nb", leaf.frame[j], points - leaf.axis[j])
+    if until is not None:
+        along = np.where(j == len(leaf.frame) - 1, there[:, 0], along)
+    place = (np.concatenate([[0.0], np.cumsum(leaf.segment_lengths)])[j] + along) / whole
+    return place, there[:, 1:]
 
 
 def _area_share(leaf: Organ, points: FloatArray) -> FloatArray:

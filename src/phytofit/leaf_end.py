@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from phytofit.flags import across_leaf
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import move
 
@@ -102,21 +103,12 @@ def points_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
 def _near_leaf(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> tuple[float, FloatArray, FloatArray]:
     """Length of the fitted midrib, and places (n,) along it and sideways, cm, of the leaf's points, and of those near
     to its straight continuation, where the fitted leaf has none."""
-    pose = likelihood.pose_of(state)
-    points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]
-    leaf = likelihood.model.organs(state.x)[1].row(0)
-    length = float(leaf.segment_lengths.sum())
-    longer = leaf.until(BEYOND)
-    piece, along = longer.nearest(points)
-    offset = points - longer.axis[piece]
-    sideways, off = (np.einsum("ni,ni->n", offset, longer.frame[piece][:, :, a]) for a in (1, 2))
-    last = piece == len(longer.frame) - 1
-    along = np.where(last, np.einsum("ni,ni->n", offset, longer.frame[piece][:, :, 0]), along)
-    at = np.append(0.0, np.cumsum(longer.segment_lengths))[piece] + along
-    box = (np.abs(sideways) < NEAR * state.noise[1]) & (np.abs(off) < NEAR * np.hypot(state.noise[1], state.noise[2]))
-    beyond = (at > length) & (at < BEYOND * length) & box & (likelihood.organ != 0)
+    length = float(likelihood.model.organs(state.x)[1].row(0).segment_lengths.sum())
+    place, across = across_leaf(likelihood, state, until=BEYOND)
+    near = NEAR * np.array([state.noise[1], np.hypot(state.noise[1], state.noise[2])])
+    beyond = (place > 1.0) & (place < BEYOND) & (np.abs(across) < near).all(axis=1) & (likelihood.organ != 0)
     theirs = (state.belongs(scores)[1] > 0.5) | beyond
-    return length, at[theirs], sideways[theirs]
+    return length, length * place[theirs], across[theirs, 0]
 
 
 def _of_strips(ends: FloatArray, along: FloatArray, lateral: FloatArray, steps: _Steps) -> FloatArray:
