@@ -14,15 +14,61 @@ ROTATION = 1e-9  # frames are products of three rotations
 QUARTER = 0.03  # of the greatest: the wave's extreme lies at 0.21 of the midrib, not at 0.25
 
 NAMES = Phytomer.PARAMETERS
-X = np.array([3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0, 0.0])
+X = np.array(
+    [3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0, 0.0, 1.0, 0.0]
+)
 LOW = np.array(
-    [0.5, 2.0, 5.0, 10.0, 1.0, -6.0, 0.1, 0.0, -40.0, -20.0, -80.0, -60.0, -90.0, -270.0, 0.1, 0.05, 0.3, 0.5, -30.0]
+    [
+        0.5,
+        2.0,
+        5.0,
+        10.0,
+        1.0,
+        -6.0,
+        0.1,
+        0.0,
+        -40.0,
+        -20.0,
+        -80.0,
+        -60.0,
+        -90.0,
+        -270.0,
+        0.1,
+        0.05,
+        0.3,
+        0.5,
+        -30.0,
+        0.5,
+        -0.012,
+    ]
 )
 HIGH = np.array(
-    [5.0, 25.0, 150.0, 80.0, 9.0, 6.0, 20.0, 1.5, 40.0, 20.0, 80.0, 60.0, 90.0, 270.0, 1.3, 0.9, 6.0, 1.5, 40.0]
+    [
+        5.0,
+        25.0,
+        150.0,
+        80.0,
+        9.0,
+        6.0,
+        20.0,
+        1.5,
+        40.0,
+        20.0,
+        80.0,
+        60.0,
+        90.0,
+        270.0,
+        1.3,
+        0.9,
+        6.0,
+        1.5,
+        40.0,
+        4.0,
+        0.012,
+    ]
 )
 
-SHAPES = arrays(np.float64, (19,), elements=st.floats(0, 1), fill=st.nothing()).map(lambda u: LOW + u * (HIGH - LOW))
+SHAPES = arrays(np.float64, (21,), elements=st.floats(0, 1), fill=st.nothing()).map(lambda u: LOW + u * (HIGH - LOW))
 
 
 def grow(x, **constants):
@@ -68,13 +114,13 @@ def assert_same(organs, others, atol):
 
 def test_neutral_values_are_those_of_the_constants():
     neutral = Phytomer(widest_share=0.3, concavity=1.5).neutral
-    assert neutral.shape == (len(NAMES),) == (19,)
-    assert len(Phytomer.UNITS) == 19
+    assert neutral.shape == (len(NAMES),) == (21,)
+    assert len(Phytomer.UNITS) == 21
     assert np.all(np.isnan(neutral[:6]))  # the paper's have none
-    np.testing.assert_array_equal(neutral[6:], [0.0] * 8 + [1.0, 0.3, 1.5, 1.0, 0.0])
+    np.testing.assert_array_equal(neutral[6:], [0.0] * 8 + [1.0, 0.3, 1.5, 1.0, 0.0, 1.0, 0.0])
 
 
-@given(SHAPES, st.integers(6, 19), st.sampled_from([0.3, 0.5, 0.62]), st.floats(1.0, 3.0))
+@given(SHAPES, st.integers(6, 21), st.sampled_from([0.3, 0.5, 0.62]), st.floats(1.0, 3.0))
 def test_neutral_values_give_the_papers_organs(x, given_parameters, widest, concavity):
     """However many of them are left out."""
     constants = {"widest_share": widest, "concavity": concavity}
@@ -116,7 +162,7 @@ def test_widths_are_those_of_a_leaf(x):
     np.testing.assert_allclose(leaf.half_width[0], half * base, rtol=1e-9)
 
 
-@given(arrays(np.float64, (4, 19), elements=st.floats(0, 1)).map(lambda u: LOW + u * (HIGH - LOW)))
+@given(arrays(np.float64, (4, 21), elements=st.floats(0, 1)).map(lambda u: LOW + u * (HIGH - LOW)))
 def test_a_population_is_its_plants_one_by_one(xs):
     stem, leaf = Phytomer().organs(xs)
     for i, x in enumerate(xs):
@@ -142,7 +188,7 @@ def test_upside_down_is_the_same_plant(x):
     np.testing.assert_allclose(pose @ pose_back, np.eye(4), atol=1e-9)
 
 
-@pytest.mark.parametrize("k", range(7, 20))
+@pytest.mark.parametrize("k", range(7, 22))
 def test_upside_down_with_any_number_of_parameters(k):
     """As with all of them, and the others neutral."""
     x = X.copy()
@@ -271,3 +317,39 @@ def test_taper_is_the_concavity_of_the_equation(taper):
 def test_a_higher_taper_keeps_the_leaf_wide_for_longer():
     widths = [shaped(leaf_taper=taper).half_width[16:-1] for taper in (0.3, 1.0, 3.0, 6.0)]
     assert np.all(np.diff(widths, axis=0) > 0)
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0, 4.0])
+def test_shoulder_is_a_power_of_the_way_from_the_widest_place_to_the_tip(power):
+    """Where Eq. (2) has the width of a share r of that way, the leaf has it at r to the power 1 / shoulder."""
+    fine = {"n_pieces": 3000}
+    half, plain = (grow([*X[:19], value, X[20]], **fine)[1].half_width for value in (power, 1.0))
+    r = (np.arange(3001) - 1500) / 1500
+    at = np.array([0.1, 0.4, 0.8, 0.95])
+    np.testing.assert_allclose(np.interp(at ** (1.0 / power), r, half), np.interp(at, r, plain), rtol=1e-3)
+    np.testing.assert_array_equal(half[:1501], plain[:1501])
+    assert half[-1] == 0.0
+
+
+@pytest.mark.parametrize("ratio", [0.7, 1.0])
+@pytest.mark.parametrize("taper", [-0.05, 0.03, 0.1])
+def test_taper_of_the_stem_is_what_its_diameter_loses_upwards(taper, ratio):
+    """Cm per cm; half-way below the leaf it is the stem's diameter, above the leaf there is another, and a leaf that
+    starts at its surface does so."""
+    x = X.copy()
+    x[[7, NAMES.index("stem_diameter_above"), NAMES.index("stem_taper")]] = 1.0, ratio, taper
+    stem, leaf = grow(x)
+    height = stem.axis[:, 2]
+    expected = (x[0] - taper * (height - x[1] / 2)) * np.where(height > x[1], ratio, 1.0)
+    np.testing.assert_allclose(2.0 * stem.half_width, expected, rtol=1e-9)
+    assert height[0] == 0.0
+    assert height[-1] == pytest.approx(x[1] + x[6])
+    assert np.all(np.diff(height) > 0.0)
+    assert leaf.axis[0, 0] == pytest.approx(0.5 * (x[0] - taper * x[1] / 2) * (1.0 + ratio) / 2.0)
+
+
+def test_a_stem_never_tapers_to_nothing():
+    x = X.copy()
+    x[NAMES.index("stem_taper")] = 0.3
+    stem, _ = grow(x)
+    assert stem.half_width.min() == pytest.approx(0.05 * x[0])

@@ -10,10 +10,10 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from phytofit.flags import across_leaf
-from phytofit.likelihood import CloudLikelihood, State
+from phytofit.likelihood import SHIFT, CloudLikelihood, State
 from phytofit.species import Species
 
-__all__ = ["along_points", "longer_leaf", "lower_insertion", "turned_blade"]
+__all__ = ["along_points", "longer_leaf", "longer_stem", "lower_insertion", "turned_blade"]
 
 FloatArray = NDArray[np.float64]
 TURNED = 30.0  # degrees, from which a blade is also begun turned
@@ -21,6 +21,7 @@ LEAST_ACROSS = 20  # points that say how a half of it lies
 LOWER, LEAST_LOWER_CM = 0.12, 2.0  # of the leaf's length, by which its insertion is also tried lower down
 PRIOR_CM = 0.2  # by which its midrib may be moved to make it a spread of the prior more plausible
 LEFT_OVER, LONGER = 0.005, (1.12, 1.3)  # share of outliers; times the leaf's length, as which it is begun
+IN_LINE, LEAST_IN_LINE = 2.0, 20  # radii and noise levels from the stem's axis; points beyond its end that are its
 N_WALKED, NEIGHBORS, LINK = 1500, 10, 3.0  # points of the leaf; neighbours; typical distances that link two of them
 N_BANDS, IN_BAND, LEAST_IN_BAND = 25, 8, 5  # of equal distance from the stem, along the leaf; points wanted, needed
 STRAY, TIP_OFF = 1.0, 0.05  # half widths off the midrib; of the leaf's length: so far off its points' line may be
@@ -83,6 +84,24 @@ def longer_leaf(state: State) -> Iterator[State]:
     for times in LONGER:
         theta = state.theta.copy()
         theta[[3, 5]] *= times  # the bend is a thirtieth of the leaf's
+        yield State(theta, state.pose, state.center)
+
+
+def longer_stem(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Iterator[State]:
+    """The state with a stem that goes on as far as points do that are left over, in line with it: beyond a gap they may
+    be too far away to draw it on."""
+    pose, x = likelihood.pose_of(state), state.x
+    points = ((likelihood.points - pose[:3, 3]) @ pose[:3, :3])[state.belongs(scores)[2] > 0.5]
+    near = np.hypot(points[:, 0], points[:, 1]) < IN_LINE * (0.5 * x[0] + state.noise[0])
+    height = points[near, 2]
+    above, below = height[height > x[1] + x[6]], height[height < 0.0]
+    theta = state.theta.copy()
+    if len(above) >= LEAST_IN_LINE:
+        theta[6] = above.max() - x[1]
+    if len(below) >= LEAST_IN_LINE:
+        theta[1] -= below.min()
+        theta[SHIFT] += below.min() * pose[:3, 2]
+    if not np.array_equal(theta, state.theta):
         yield State(theta, state.pose, state.center)
 
 

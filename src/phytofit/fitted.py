@@ -136,7 +136,7 @@ class Fit:
 
     def _ends(self) -> Ends:
         """How far the traits' intervals reach: by the errors of the parameters, by how far the blade's surface lies
-        off the model's where it leaves the stem, by how far its width does, and by what the stem's surface hides."""
+        off the model's where it leaves the stem, by how far its width does, and by what the stem hides of it."""
         assert self.estimate is not None
         assert self.trait_covariance is not None
         space, made = self.species.space, self.estimate
@@ -151,8 +151,17 @@ class Fit:
         by_width = (names == "leaf_width") * made.quantile * made.width_misfit * self._values(self.x)
         hidden, leaf = made.sighting.along_stem * self.scale, self._organs_of(self.x)[1]
         strip = float(leaf.until(hidden / leaf.segment_lengths.sum()).area) if hidden else 0.0
+        further = max(0.0, self._further_down(off) - float(changes[1, names == "leaf_length"][0]))
+        hidden, strip = hidden + further, strip + 2.0 * float(leaf.half_width[0]) * further
         by_stem = (names == "leaf_length") * hidden + (names == "leaf_area") * strip
         return ends.with_error(by_width, by_width + by_stem)
+
+    def _further_down(self, off: float) -> float:
+        """How much further down its stem, cm, a leaf may start that lies `off` cm off where it was fitted: it nears the
+        stem as its chord does, below its midrib's start as well."""
+        angle = next(trait.value for trait in self._measured(self.x) if trait.name == "leaf_angle")
+        below = self.parameters["stem_length"]
+        return float(min(below, off / max(np.tan(np.deg2rad(angle)), 1e-9))) if 0.0 < angle < 90.0 else 0.0
 
     def _values(self, x: FloatArray, *, thicker: float = 0.0, whole: bool = False) -> FloatArray:
         """Values (t,) of the traits, of a stem with a radius so much larger, of the leaf as it ends, or `whole`."""

@@ -15,7 +15,7 @@ from phytofit.kernels.likelihood import CHANGES, log_density, segment_changes
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
 
-__all__ = ["LEAF_NOISE", "NOISE", "OUTLIERS", "SHARES", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
+__all__ = ["LEAF_NOISE", "NOISE", "OUTLIERS", "SHARES", "SHIFT", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 
 FloatArray = NDArray[np.float64]
 N_EXTRA = 14  # entries of theta after the model's parameters, see State

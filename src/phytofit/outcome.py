@@ -123,7 +123,7 @@ def outcome(chosen: Chosen, history: tuple[Generation, ...], *, dithered: bool) 
         evidence=chosen.evidence,
         inflation=dependence.inflation,
         misfit_cm=misfit_of(dependence, state.noise),
-        width_misfit=width_misfit(likelihood, state, at.scores, dependence.leaf),
+        width_misfit=width_misfit(likelihood, state, at.scores, min(dependence.stem, dependence.leaf)),
         correlated_cm=dependence.leaf.reach_cm,
         rival=chosen.rival,
         quantile=float(stdtrit(left, 0.975)),

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from functools import partial
 from operator import itemgetter
 
@@ -11,7 +12,7 @@ from scipy.linalg import pinvh
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from phytofit.beginnings import along_points, longer_leaf, lower_insertion, turned_blade
+from phytofit.beginnings import along_points, longer_leaf, longer_stem, lower_insertion, turned_blade
 from phytofit.dependence import score_dependence
 from phytofit.distances import Reference, chamfer
 from phytofit.flags import OFFSET, along_stem
@@ -162,10 +163,11 @@ def _rich(species: Species, cloud: Cloud, simple: End) -> tuple[End, End]:
 
 
 def _elsewhere(species: Species, cloud: Cloud, best: End, rounds: int) -> End:
-    """The best so far, or where a turned blade, a midrib along the points, or an insertion lower down leads to, if it
-    fits better."""
+    """The best so far, or where a turned blade, more leaf or stem, a midrib along the points, or an insertion lower
+    down leads to, if it fits better."""
     best = _better(species, cloud, best, turned_blade(species, best.likelihood, best.state, best.at.scores))
     best = _better(species, cloud, best, longer_leaf(best.state))
+    best = _better(species, cloud, best, longer_stem(best.likelihood, best.state, best.at.scores))
     best = _better(species, cloud, best, along_points(species, best.likelihood, best.state, best.at.scores))
     for _ in range(rounds):
         lower = _better(species, cloud, best, lower_insertion(species, best.state))
@@ -190,7 +192,14 @@ def _choice(found: Sequence[End]) -> Chosen:
 
     Of a richer leaf the taper is estimated too, and says little of a tip that was not seen: it is taken as whole.
     """
-    dependence = score_dependence(found[-1].likelihood, found[-1].state)  # the richest: least misfit
+    richest = found[-1]  # least misfit
+    dependence = score_dependence(richest.likelihood, richest.state)
+    inflation = dependence.inflation
+    if (
+        dependence.stem.correlation < dependence.leaf.correlation
+    ):  # the rest is misfit, of which a better model has less
+        of_sensor = replace(dependence, leaf=dependence.stem)
+        inflation = score_dependence(richest.likelihood, richest.state, of_sensor).inflation
     fits = [end.fit_of_points / dependence.inflation for end in found]
     gains = [0.0] * len(found)  # by a missing tip
     for whole in range(0, len(found), 2):
@@ -200,7 +209,7 @@ def _choice(found: Sequence[End]) -> Chosen:
             gain = min(gain, gain_of_blunt_end(end.likelihood, end.state, end.at.scores) / dependence.inflation)
         gains[whole] = gains[whole + 1] = gain
     odds = [0.0, 0.0, RARE, RARE]
-    evidence = [evidence_of(end, dependence.inflation) + o for end, o in zip(found, odds, strict=False)]
+    evidence = [evidence_of(end, inflation) + o for end, o in zip(found, odds, strict=False)]
     backed = [e if i % 2 == 0 or gains[i] > TIP_MISSING else -np.inf for i, e in enumerate(evidence)]
     best = int(np.argmax(backed))
     others = [i for i in range(len(found)) if i // 2 != best // 2 and backed[i] > backed[best] - ABOUT_AS_PROBABLE]

@@ -11,6 +11,8 @@ __all__ = ["Phytomer"]
 
 FloatArray = NDArray[np.float64]
 COLLAR_CM = 0.5  # above and below the junction, where the stem's diameter changes, if it does
+N_TAPERED = 3  # pieces of a stem that tapers, above the leaf and below it
+LEAST_DIAMETER = 0.1  # of the stem's, where it tapers
 BASE_SHARE = 0.05  # of the midrib, over which the bend of its base falls to 1 / e
 UPRIGHT = frames_along(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.0, 1.0, 0.0]))
 
@@ -43,6 +45,8 @@ class Phytomer:
     leaf_taper             -     ``concavity``
     stem_diameter_above    share of the stem's diameter, above the leaf: its sheath ends there
     leaf_base_bend         deg   that the midrib turns down close to its start, over a twentieth of it or so
+    leaf_shoulder          -     power of r in Eq. (2): above 1 the blade stays wide for longer, and is rounded there
+    stem_taper             -     that the stem's diameter loses upwards, cm per cm; X1 is its mean below the leaf
     ====================== ===== =================================================================================
     """
 
@@ -71,16 +75,39 @@ class Phytomer:
         "leaf_taper",
         "stem_diameter_above",
         "leaf_base_bend",
+        "leaf_shoulder",
+        "stem_taper",
     )
-    UNITS = ("cm", "cm", "deg", "cm", "cm", "deg", "cm", "share", *["deg"] * 6, "share", "share", "1", "share", "deg")
+    UNITS = (
+        "cm",
+        "cm",
+        "deg",
+        "cm",
+        "cm",
+        "deg",
+        "cm",
+        "share",
+        *["deg"] * 6,
+        "share",
+        "share",
+        "1",
+        "share",
+        "deg",
+        "1",
+        "1",
+    )
 
     @property
     def neutral(self) -> FloatArray:
         """Values (k,) of the parameters; those after the sixth give the paper's model."""
-        return np.array([*[np.nan] * 6, *[0.0] * 8, 1.0, self.widest_share, self.concavity, 1.0, 0.0])
+        return np.array([*[np.nan] * 6, *[0.0] * 8, 1.0, self.widest_share, self.concavity, 1.0, 0.0, 1.0, 0.0])
 
     def width_profile(
-        self, base: FloatArray | None = None, widest: FloatArray | None = None, taper: FloatArray | None = None
+        self,
+        base: FloatArray | None = None,
+        widest: FloatArray | None = None,
+        taper: FloatArray | None = None,
+        shoulder: FloatArray | None = None,
     ) -> FloatArray:
         """Width at the nodes 0 .. n_pieces as a share of the widest, Eq. (2); (n, n_pieces + 1) of (n,) parameters.
 
@@ -92,6 +119,8 @@ class Phytomer:
         i = np.arange(self.n_pieces + 1)
         i_max = widest[:, np.newaxis] * self.n_pieces
         r = np.clip((i - i_max) / (self.n_pieces - i_max), 0.0, 1.0)
+        if shoulder is not None:
+            r = r ** shoulder[:, np.newaxis]
         profile: FloatArray = (k + np.log(1.0 - r + np.exp(-k))) / (k + np.log(1.0 + np.exp(-k)))  # Eq. (2)
         profile[:, -1] = 0.0  # exactly: k + log(e^-k)
         rise = np.sin(0.5 * np.pi * np.clip(i / np.maximum(i_max, 1e-9), 0.0, 1.0))
@@ -116,16 +145,22 @@ class Phytomer:
         n, given = xs.shape
         rest = np.broadcast_to(self.neutral[given:], (n, len(self.PARAMETERS) - given))
         diameter, below, leaf_angle, leaf_length, leaf_width, rotate, above, offset, *shape = np.hstack([xs, rest]).T
-        bow, wave, side_bend, side_bow, roll, twist, *profile, ratio, base_bend = shape
+        bow, wave, side_bend, side_bow, roll, twist, *profile, ratio, base_bend, shoulder, stem_taper = shape
+        base, widest, taper = profile
+        at_leaf = np.maximum(diameter - 0.5 * stem_taper * below, LEAST_DIAMETER * diameter)  # below the sheath's end
         if given <= self.PARAMETERS.index("stem_diameter_above"):
-            height, half_width = (
-                np.stack([0.0 * below, below + above], 1),
-                np.repeat(0.5 * diameter[:, np.newaxis], 2, 1),
-            )
+            height = np.stack([0.0 * below, below + above], 1)
+            half_width = np.repeat(0.5 * diameter[:, np.newaxis], 2, 1)
         else:  # one diameter goes over into the other around the junction
             step = np.minimum(COLLAR_CM, 0.5 * np.minimum(below, above))
-            height = np.stack([0.0 * below, below - step, below + step, below + above], 1)
-            half_width = 0.5 * np.stack([diameter, diameter, diameter * ratio, diameter * ratio], 1)
+            node = np.linspace(0.0, 1.0, 1 + (N_TAPERED if given > self.PARAMETERS.index("stem_taper") else 1))
+            under = np.outer(below - step, node)
+            over = (below + above)[:, np.newaxis] - np.outer(above - step, 1.0 - node)
+            height = np.hstack([under, over])
+            lost = stem_taper[:, np.newaxis] * (height - 0.5 * below[:, np.newaxis])
+            there = np.maximum(diameter[:, np.newaxis] - lost, LEAST_DIAMETER * diameter[:, np.newaxis])
+            there[:, len(node) :] *= ratio[:, np.newaxis]
+            half_width = 0.5 * there
         stem_axis = np.zeros((*height.shape, 3))
         stem_axis[..., 2] = height
         stem = Organ(STEM, stem_axis, np.tile(UPRIGHT, (n, height.shape[1] - 1, 1, 1)), half_width)
@@ -140,8 +175,9 @@ class Phytomer:
         midrib = np.zeros((n, self.n_pieces + 1, 3))
         midrib[:, 1:] = np.cumsum((leaf_length / self.n_pieces)[:, np.newaxis, np.newaxis] * frame[..., 0], axis=1)
         midrib[:, :, 2] += below[:, np.newaxis]
-        midrib[:, :, 0] += (0.25 * diameter * (1.0 + ratio) * offset)[:, np.newaxis]
-        leaf = Organ(LEAF, midrib, frame, 0.5 * leaf_width[:, np.newaxis] * self.width_profile(*profile))
+        midrib[:, :, 0] += (0.25 * at_leaf * (1.0 + ratio) * offset)[:, np.newaxis]
+        share = self.width_profile(base, widest, taper, shoulder)
+        leaf = Organ(LEAF, midrib, frame, 0.5 * leaf_width[:, np.newaxis] * share)
         return stem, leaf
 
     @classmethod
@@ -166,14 +202,21 @@ class Phytomer:
         ):
             if name in names:
                 turn[names.index(name), names.index(name)] = -1.0
-        offset = np.zeros(len(x))
-        offset[2] = 180.0
+        there = turn @ x
+        there[2] += 180.0
         if "stem_diameter_above" in names:
             above = names.index("stem_diameter_above")
-            ratio = x[above]
-            turn[0, [0, above]] = ratio, x[0]
+            ratio, middle = x[above], x[0]
+            if "stem_taper" in names:  # the diameter above the leaf is that at another height
+                taper, half = names.index("stem_taper"), 0.5 * (x[1] + x[6])
+                middle -= x[taper] * half
+                turn[0, [1, 6, taper]] = -0.5 * ratio * x[taper], -0.5 * ratio * x[taper], -ratio * half
+                turn[taper, [above, taper]] = -x[taper], -ratio
+                there[taper] = -ratio * x[taper]
+            turn[0, [0, above]] = ratio, middle
             turn[above, above] = -1.0 / ratio**2
-            offset[[0, above]] = np.array([x[0] * ratio, 1.0 / ratio]) - (turn @ x)[[0, above]]
+            there[[0, above]] = ratio * middle, 1.0 / ratio
+        offset = there - turn @ x
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[2, 3] = x[1] + x[6]
         return turn, offset, pose
