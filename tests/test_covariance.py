@@ -60,7 +60,7 @@ def at_rest(made, upper_taper):
 
 @pytest.fixture(scope="module")
 def made():
-    return phytofit.simulate(fixed={"leaf_taper": 3.0}, n_points=1500, noise_cm=0.3, seed=4)
+    return phytofit.simulate(fixed={"leaf_taper": 3.0, "collar_offset": 0.5}, n_points=1500, noise_cm=0.3, seed=4)
 
 
 def test_others_do_not_follow_a_parameter_that_its_bound_holds(made):

@@ -194,11 +194,9 @@ def _choice(found: Sequence[End]) -> Chosen:
     """
     richest = found[-1]  # least misfit
     dependence = score_dependence(richest.likelihood, richest.state)
-    inflation = dependence.inflation
-    if (
-        dependence.stem.correlation < dependence.leaf.correlation
-    ):  # the rest is misfit, of which a better model has less
-        of_sensor = replace(dependence, leaf=dependence.stem)
+    inflation, (on_stem, on_leaf) = dependence.inflation, (dependence.stem, dependence.leaf)
+    if on_stem.correlation < on_leaf.correlation:  # the sensor's is on both; the rest is misfit: less of a better model
+        of_sensor = replace(dependence, leaf=on_stem)
         inflation = score_dependence(richest.likelihood, richest.state, of_sensor).inflation
     fits = [end.fit_of_points / dependence.inflation for end in found]
     gains = [0.0] * len(found)  # by a missing tip
