@@ -14,59 +14,13 @@ ROTATION = 1e-9  # frames are products of three rotations
 QUARTER = 0.03  # of the greatest: the wave's extreme lies at 0.21 of the midrib, not at 0.25
 
 NAMES = Phytomer.PARAMETERS
+LOW_SHAPE = [-80.0, -60.0, -90.0, -270.0, 0.1, 0.05, 0.3, 0.5, -30.0, 1.0, -0.02]
+HIGH_SHAPE = [80.0, 60.0, 90.0, 270.0, 1.3, 0.9, 6.0, 1.5, 40.0, 4.0, 0.02]
 X = np.array(
     [3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0, 0.0, 1.0, 0.0]
 )
-LOW = np.array(
-    [
-        0.5,
-        2.0,
-        5.0,
-        10.0,
-        1.0,
-        -6.0,
-        0.1,
-        0.0,
-        -40.0,
-        -20.0,
-        -80.0,
-        -60.0,
-        -90.0,
-        -270.0,
-        0.1,
-        0.05,
-        0.3,
-        0.5,
-        -30.0,
-        0.5,
-        -0.012,
-    ]
-)
-HIGH = np.array(
-    [
-        5.0,
-        25.0,
-        150.0,
-        80.0,
-        9.0,
-        6.0,
-        20.0,
-        1.5,
-        40.0,
-        20.0,
-        80.0,
-        60.0,
-        90.0,
-        270.0,
-        1.3,
-        0.9,
-        6.0,
-        1.5,
-        40.0,
-        4.0,
-        0.012,
-    ]
-)
+LOW = np.array([*[0.5, 2.0, 5.0, 10.0, 1.0, -6.0, 0.1, 0.0, -40.0, -20.0], *LOW_SHAPE])
+HIGH = np.array([*[5.0, 25.0, 150.0, 80.0, 9.0, 6.0, 20.0, 1.5, 40.0, 20.0], *HIGH_SHAPE])
 
 SHAPES = arrays(np.float64, (21,), elements=st.floats(0, 1), fill=st.nothing()).map(lambda u: LOW + u * (HIGH - LOW))
 
@@ -334,22 +288,37 @@ def test_shoulder_is_a_power_of_the_way_from_the_widest_place_to_the_tip(power):
 @pytest.mark.parametrize("ratio", [0.7, 1.0])
 @pytest.mark.parametrize("taper", [-0.05, 0.03, 0.1])
 def test_taper_of_the_stem_is_what_its_diameter_loses_upwards(taper, ratio):
-    """Cm per cm; half-way below the leaf it is the stem's diameter, above the leaf there is another, and a leaf that
-    starts at its surface does so."""
+    """Cm per cm, half-way below the leaf, where it is the stem's diameter; it falls by the same share with each cm,
+    above the leaf there is another, and a leaf that starts at its surface does so."""
     x = X.copy()
     x[[7, NAMES.index("stem_diameter_above"), NAMES.index("stem_taper")]] = 1.0, ratio, taper
     stem, leaf = grow(x)
     height = stem.axis[:, 2]
-    expected = (x[0] - taper * (height - x[1] / 2)) * np.where(height > x[1], ratio, 1.0)
-    np.testing.assert_allclose(2.0 * stem.half_width, expected, rtol=1e-9)
+    expected = x[0] * (1.0 - taper / x[0]) ** (height - x[1] / 2) * np.where(height > x[1], ratio, 1.0)
+    np.testing.assert_allclose(2.0 * stem.half_width, expected, rtol=0.02)  # compounded by the cm
+    close = np.interp([x[1] / 2 - 0.01, x[1] / 2 + 0.01], height, stem.half_width)
+    assert -np.diff(close)[0] / 0.01 == pytest.approx(taper, rel=0.05)
     assert height[0] == 0.0
     assert height[-1] == pytest.approx(x[1] + x[6])
     assert np.all(np.diff(height) > 0.0)
-    assert leaf.axis[0, 0] == pytest.approx(0.5 * (x[0] - taper * x[1] / 2) * (1.0 + ratio) / 2.0)
+    at_leaf = np.interp(x[1], height, stem.half_width)
+    assert leaf.axis[0, 0] == pytest.approx(at_leaf, rel=0.01)
 
 
-def test_a_stem_never_tapers_to_nothing():
+@pytest.mark.parametrize("taper", [0.3, -0.2])
+def test_a_stem_never_tapers_to_nothing(taper):
     x = X.copy()
-    x[NAMES.index("stem_taper")] = 0.3
+    x[[0, NAMES.index("stem_taper")]] = 0.5, taper
     stem, _ = grow(x)
-    assert stem.half_width.min() == pytest.approx(0.05 * x[0])
+    assert 0.5 * 0.5 * np.exp(-2.0) <= stem.half_width.min() < stem.half_width.max() <= 0.5 * 0.5 * np.exp(2.0)
+
+
+@given(SHAPES)
+def test_plants_near_one_are_upside_down_near_its_twin(x):
+    """To first order: the slopes by differences of the twins themselves."""
+    turn, _, _ = Phytomer.upside_down(x)
+    step = 1e-6
+    for i in range(len(x)):
+        both = [x + sign * step * (np.arange(len(x)) == i) for sign in (1.0, -1.0)]
+        there, back = (turned @ near + offset for near in both for turned, offset, _ in [Phytomer.upside_down(near)])
+        np.testing.assert_allclose((there - back) / (2.0 * step), turn[:, i], rtol=1e-4, atol=1e-5)

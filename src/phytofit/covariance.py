@@ -4,11 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, pinvh
 
-from phytofit.dependence import Dependence
+from phytofit.dependence import Bell, Dependence
 from phytofit.intervals import covariance_of_independent
 from phytofit.likelihood import CloudLikelihood, Evaluation, State
 
-__all__ = ["covariance_of", "grown", "misfit_of", "mixed", "shared_by_neighbors"]
+__all__ = ["covariance_of", "grown", "misfit_of", "mixed", "of_sensor", "shared_by_neighbors"]
 
 FloatArray = NDArray[np.float64]
 LEAST_KNOWN = 1e-9  # information on an entry of theta, below which it is none: labels may leave no share to be told
@@ -66,8 +66,15 @@ def mixed(covariance: FloatArray, other: FloatArray, apart: FloatArray, probabil
 def misfit_of(dependence: Dependence, noise: FloatArray) -> float:
     """How far, cm, the blade's surface lies off the model's: by what errors of neighbours on it share beyond what those
     on the stem do, for a sensor's are on both, and are in the covariance.  ``noise`` (3,) as of a :class:`State`."""
-    of_sensor = dependence.stem.correlation * float(noise[0] ** 2)
-    return float(np.sqrt(max(0.0, shared_by_neighbors(dependence, noise) ** 2 - of_sensor)))
+    everything, sensors = dependence.leaf.correlation, of_sensor(dependence, noise).correlation
+    return float(np.sqrt((everything - sensors) * float(noise[1] ** 2 + noise[2] ** 2)))
+
+
+def of_sensor(dependence: Dependence, noise: FloatArray) -> Bell:
+    """How the sensor's errors of neighbours on the leaf are correlated: those that neighbours on the stem share are on
+    both, in squares of cm.  ``noise`` (3,) as of a :class:`State`."""
+    on_stem = dependence.stem.correlation * float(noise[0] ** 2) / float(noise[1] ** 2 + noise[2] ** 2)
+    return dependence.leaf._replace(correlation=min(dependence.leaf.correlation, on_stem))
 
 
 def shared_by_neighbors(dependence: Dependence, noise: FloatArray) -> float:

@@ -268,7 +268,7 @@ def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
     turn, offset, pose = result.species.model.upside_down(result.x)
     pose[:3, 3] *= result.scale
     searched = len(result.history[0].mean)
-    part, shift = turn[:searched, :searched], offset[:searched]
+    part, shift, _ = result.species.model.upside_down(result.x[:searched])
     twin = replace(
         result,
         x=turn @ result.x + offset,

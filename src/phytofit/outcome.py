@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from phytofit.covariance import covariance_of, grown, misfit_of, mixed, shared_by_neighbors
+from phytofit.covariance import covariance_of, grown, misfit_of, mixed, of_sensor, shared_by_neighbors
 from phytofit.dependence import Dependence, score_dependence, width_misfit
 from phytofit.flags import Sighting, sighting
 from phytofit.leaf_end import Ending, ending
 from phytofit.optimize import Generation
-from phytofit.refining import End, refinement
+from phytofit.refining import End, evidence_of, refinement
 from phytofit.tip import gain_of_blunt_end
 from phytofit.whole_pieces import of_whole_pieces
 
@@ -36,7 +36,6 @@ class Chosen(NamedTuple):
     """The end that the cloud backs best."""
 
     end: End
-    evidence: float
     dependence: Dependence
     tip_doubtful: bool
     blunt: bool
@@ -120,10 +119,10 @@ def outcome(chosen: Chosen, history: tuple[Generation, ...], *, dithered: bool) 
         ends_at=ends.share,
         log_p=at.log_p,
         error=at.error,
-        evidence=chosen.evidence,
+        evidence=evidence_of(end, dependence.inflation),
         inflation=dependence.inflation,
         misfit_cm=misfit_of(dependence, state.noise),
-        width_misfit=width_misfit(likelihood, state, at.scores, min(dependence.stem, dependence.leaf)),
+        width_misfit=width_misfit(likelihood, state, at.scores, of_sensor(dependence, state.noise)),
         correlated_cm=dependence.leaf.reach_cm,
         rival=chosen.rival,
         quantile=float(stdtrit(left, 0.975)),

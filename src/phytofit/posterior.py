@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from phytofit.beginnings import along_points, longer_leaf, longer_stem, lower_insertion, turned_blade
+from phytofit.covariance import of_sensor
 from phytofit.dependence import score_dependence
 from phytofit.distances import Reference, chamfer
 from phytofit.flags import OFFSET, along_stem
@@ -36,7 +37,9 @@ START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some
 CUT_SHARES = (0.85, 0.97)  # of the midrib, from which the search for a missing tip starts; the second of rich leaves
 DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
-SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: its twelve parameters gain six by chance, and cost more
+SHAPE_PROMISE = (
+    12.0  # nats for which a richer leaf is tried: its fourteen parameters gain seven by chance, and cost more
+)
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning, or is known of the stem, must fit better
 ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
@@ -194,10 +197,10 @@ def _choice(found: Sequence[End]) -> Chosen:
     """
     richest = found[-1]  # least misfit
     dependence = score_dependence(richest.likelihood, richest.state)
-    inflation, (on_stem, on_leaf) = dependence.inflation, (dependence.stem, dependence.leaf)
-    if on_stem.correlation < on_leaf.correlation:  # the sensor's is on both; the rest is misfit: less of a better model
-        of_sensor = replace(dependence, leaf=on_stem)
-        inflation = score_dependence(richest.likelihood, richest.state, of_sensor).inflation
+    inflation, sensors = dependence.inflation, of_sensor(dependence, richest.state.noise)
+    if sensors.correlation < dependence.leaf.correlation:  # the rest is misfit, of which a better model has less
+        without = replace(dependence, leaf=sensors)
+        inflation = score_dependence(richest.likelihood, richest.state, without).inflation
     fits = [end.fit_of_points / dependence.inflation for end in found]
     gains = [0.0] * len(found)  # by a missing tip
     for whole in range(0, len(found), 2):
@@ -217,7 +220,7 @@ def _choice(found: Sequence[End]) -> Chosen:
     if best < len(found) - 1:
         dependence = score_dependence(found[best].likelihood, found[best].state, dependence)
     doubtful = best % 2 == 0 and gains[best] > TIP_DOUBTFUL
-    return Chosen(found[best], evidence[best], dependence, doubtful, blunt, rival)
+    return Chosen(found[best], dependence, doubtful, blunt, rival)
 
 
 def _one_sided(chosen: Chosen) -> Chosen:
@@ -231,7 +234,7 @@ def _one_sided(chosen: Chosen) -> Chosen:
     lead = evidence_of(end, chosen.dependence.inflation) - evidence_of(chosen.end, chosen.dependence.inflation)
     if lead < CLEARLY_BETTER:
         return chosen
-    return chosen._replace(end=end, evidence=chosen.evidence + lead, dependence=score_dependence(free, there))
+    return chosen._replace(end=end, dependence=score_dependence(free, there))
 
 
 def _at_surface(species: Species, chosen: Chosen) -> Chosen:
@@ -251,7 +254,6 @@ def _at_surface(species: Species, chosen: Chosen) -> Chosen:
         return chosen
     return chosen._replace(
         end=end,
-        evidence=chosen.evidence + lead,
         dependence=score_dependence(held, there, chosen.dependence),
         elsewhere=Elsewhere(chosen.end, chosen.dependence, float(expit(-lead))),
     )

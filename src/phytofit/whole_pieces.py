@@ -17,8 +17,9 @@ LEAST_WHOLE = 0.1  # of the leaf's pieces
 def of_whole_pieces(likelihood: CloudLikelihood, state: State) -> CloudLikelihood | None:
     """The likelihood of the points on those pieces of the leaf that have no hole, and whose neighbours have none.
 
-    It may change the leaf's width along the midrib, the noise on the leaf and the shares; all else is held where
-    `state` has it.  None where no holes are known, or hardly a piece is whole: then nothing better is known.
+    It may change the leaf's width along the midrib (but for its shoulder, which hardly shows on a part), the noise on
+    the leaf and the shares; all else is held where `state` has it.  None where no holes are known, or hardly a piece is
+    whole: then nothing better is known.
 
     Which points were left out was decided by where they lie along the leaf alone.  So the density of those that are
     left is that of the whole leaf, divided by what it has on these pieces, and where the holes end across the blade,

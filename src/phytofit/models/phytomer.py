@@ -12,7 +12,7 @@ __all__ = ["Phytomer"]
 FloatArray = NDArray[np.float64]
 COLLAR_CM = 0.5  # above and below the junction, where the stem's diameter changes, if it does
 N_TAPERED = 3  # pieces of a stem that tapers, above the leaf and below it
-LEAST_DIAMETER = 0.1  # of the stem's, where it tapers
+MOST_TAPERED = 2.0  # of the logarithm of the diameter, at the ends of a stem that tapers
 BASE_SHARE = 0.05  # of the midrib, over which the bend of its base falls to 1 / e
 UPRIGHT = frames_along(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([0.0, 1.0, 0.0]))
 
@@ -46,7 +46,7 @@ class Phytomer:
     stem_diameter_above    share of the stem's diameter, above the leaf: its sheath ends there
     leaf_base_bend         deg   that the midrib turns down close to its start, over a twentieth of it or so
     leaf_shoulder          -     power of r in Eq. (2): above 1 the blade stays wide for longer, and is rounded there
-    stem_taper             -     that the stem's diameter loses upwards, cm per cm; X1 is its mean below the leaf
+    stem_taper             -     that the stem's diameter loses upwards, cm per cm, half-way below the leaf, where it is X1
     ====================== ===== =================================================================================
     """
 
@@ -147,7 +147,8 @@ class Phytomer:
         diameter, below, leaf_angle, leaf_length, leaf_width, rotate, above, offset, *shape = np.hstack([xs, rest]).T
         bow, wave, side_bend, side_bow, roll, twist, *profile, ratio, base_bend, shoulder, stem_taper = shape
         base, widest, taper = profile
-        at_leaf = np.maximum(diameter - 0.5 * stem_taper * below, LEAST_DIAMETER * diameter)  # below the sheath's end
+        log_slope = stem_taper / diameter
+        at_leaf = diameter * np.exp(-np.clip(0.5 * log_slope * below, -MOST_TAPERED, MOST_TAPERED))
         if given <= self.PARAMETERS.index("stem_diameter_above"):
             height = np.stack([0.0 * below, below + above], 1)
             half_width = np.repeat(0.5 * diameter[:, np.newaxis], 2, 1)
@@ -157,8 +158,8 @@ class Phytomer:
             under = np.outer(below - step, node)
             over = (below + above)[:, np.newaxis] - np.outer(above - step, 1.0 - node)
             height = np.hstack([under, over])
-            lost = stem_taper[:, np.newaxis] * (height - 0.5 * below[:, np.newaxis])
-            there = np.maximum(diameter[:, np.newaxis] - lost, LEAST_DIAMETER * diameter[:, np.newaxis])
+            lost = log_slope[:, np.newaxis] * (height - 0.5 * below[:, np.newaxis])
+            there = diameter[:, np.newaxis] * np.exp(-np.clip(lost, -MOST_TAPERED, MOST_TAPERED))
             there[:, len(node) :] *= ratio[:, np.newaxis]
             half_width = 0.5 * there
         stem_axis = np.zeros((*height.shape, 3))
@@ -205,17 +206,21 @@ class Phytomer:
         there = turn @ x
         there[2] += 180.0
         if "stem_diameter_above" in names:
-            above = names.index("stem_diameter_above")
-            ratio, middle = x[above], x[0]
-            if "stem_taper" in names:  # the diameter above the leaf is that at another height
-                taper, half = names.index("stem_taper"), 0.5 * (x[1] + x[6])
-                middle -= x[taper] * half
-                turn[0, [1, 6, taper]] = -0.5 * ratio * x[taper], -0.5 * ratio * x[taper], -ratio * half
-                turn[taper, [above, taper]] = -x[taper], -ratio
-                there[taper] = -ratio * x[taper]
-            turn[0, [0, above]] = ratio, middle
+            above, taper = names.index("stem_diameter_above"), cls.PARAMETERS.index("stem_taper")
+            diameter, ratio, slope = x[0], x[above], x[taper] if taper < len(x) else 0.0
+            half = 0.5 * (x[1] + x[6])  # from the middle of what is below the leaf to that of what is above it
+            other = ratio * diameter * np.exp(-slope * half / diameter)
+            of_log = np.zeros(len(x))  # derivatives of the logarithm of the other diameter
+            of_log[[1, 6]] = -0.5 * slope / diameter
+            of_log[[0, above]] = (1.0 + slope * half / diameter) / diameter, 1.0 / ratio
+            if taper < len(x):
+                of_log[taper] = -half / diameter
+                there[taper] = -slope * other / diameter
+                turn[taper] = there[taper] * of_log
+                turn[taper, [0, taper]] += slope * other / diameter**2, -other / diameter
+            turn[0] = other * of_log
             turn[above, above] = -1.0 / ratio**2
-            there[[0, above]] = ratio * middle, 1.0 / ratio
+            there[[0, above]] = other, 1.0 / ratio
         offset = there - turn @ x
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
         pose[2, 3] = x[1] + x[6]
