@@ -46,7 +46,7 @@ class Phytomer:
     stem_diameter_above    share of the stem's diameter, above the leaf: its sheath ends there
     leaf_base_bend         deg   that the midrib turns down close to its start, over a twentieth of it or so
     leaf_shoulder          -     power of r in Eq. (2): above 1 the blade stays wide for longer, and is rounded there
-    stem_taper             -     that the stem's diameter loses upwards, cm per cm, half-way below the leaf, where it is X1
+    stem_taper             -     cm of its diameter that the stem loses with each cm, half-way below the leaf
     ====================== ===== =================================================================================
     """
 
