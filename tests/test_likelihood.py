@@ -282,9 +282,15 @@ def test_labelled_points_count_only_on_their_organ():
     unknown, stem, leaf = (density(points, organs, **settings, organ=organ) for organ in (-1, 0, 1))
     np.testing.assert_allclose(unknown, stem + leaf - 0.1 * 1e-5, rtol=EXACT)
     np.testing.assert_allclose(stem[np.linalg.norm(points[:, :2], axis=1) > 6.0], 0.1 * 1e-5, rtol=EXACT)
+
+    def at_leaf(diameter):
+        return diameter * np.exp(-0.03 * 7.0 / diameter)
+
     other = grow([*SHAPED[:3], 30.0, 4.0, *SHAPED[5:]])
     np.testing.assert_array_equal(density(points, other, **settings, organ=0), stem)
-    thicker = grow([2.0, *SHAPED[1:7], 0.8 * 2.99 / 1.79, *SHAPED[8:]])  # a thinner stem with the leaf where it was
+    thicker = grow(
+        [2.0, *SHAPED[1:7], 0.8 * at_leaf(3.2) / at_leaf(2.0), *SHAPED[8:]]
+    )  # a thinner stem with the leaf where it was
     np.testing.assert_allclose(density(points, thicker, **settings, organ=1), leaf, rtol=EXACT)
     assert np.all(stem[label == 0] > leaf[label == 0])
 

@@ -137,7 +137,8 @@ def _unevenness(along: FloatArray, expected: FloatArray, steps: _Steps) -> float
     edges = np.searchsorted(before, np.arange(1, N_BANDS) / N_BANDS)
     wanted = len(along) * np.diff(np.concatenate([[0.0], before[edges], [1.0]]))
     found = np.histogram(along, np.concatenate([[-np.inf], steps.at[edges] + 0.5 * steps.long, [np.inf]]))[0]
-    return max(1.0, float(np.sum((found - wanted) ** 2 / wanted)) / (N_BANDS - 3))
+    bands = wanted > 0.0  # none where the expected all lie in one step, of a leaf hardly seen there
+    return max(1.0, float(np.sum((found - wanted)[bands] ** 2 / wanted[bands])) / (N_BANDS - 3))
 
 
 def _seen_along(likelihood: CloudLikelihood, state: State, at: FloatArray) -> FloatArray:

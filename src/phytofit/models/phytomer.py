@@ -147,7 +147,7 @@ class Phytomer:
         diameter, below, leaf_angle, leaf_length, leaf_width, rotate, above, offset, *shape = np.hstack([xs, rest]).T
         bow, wave, side_bend, side_bow, roll, twist, *profile, ratio, base_bend, shoulder, stem_taper = shape
         base, widest, taper = profile
-        log_slope = stem_taper / diameter
+        log_slope = stem_taper / np.where(diameter > 0.0, diameter, 1.0)
         at_leaf = diameter * np.exp(-np.clip(0.5 * log_slope * below, -MOST_TAPERED, MOST_TAPERED))
         if given <= self.PARAMETERS.index("stem_diameter_above"):
             height = np.stack([0.0 * below, below + above], 1)
