@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import phytofit
+from phytofit import leaf_end
 from phytofit.fitted import remarked
 from phytofit.hidden import N_STRIPS, Hidden
 from phytofit.leaf_end import MISFIT, PointsEnd, combined, ending, points_end
@@ -219,3 +220,14 @@ def test_a_leaf_that_ends_bluntly_may_lack_its_tip():
     assert len(result.x) > 7
     assert not result.estimate.tip_seen
     assert next(t for t in result.traits if t.name == "leaf_length").high is None
+
+
+def test_bands_in_which_no_points_are_expected_say_nothing_of_unevenness():
+    """All that is expected lies in one step, and half of the points with it: seven bands of eight have no width."""
+    steps = leaf_end._Steps(np.arange(60) + 0.5, 1.0, np.ones(60))
+    expected = np.zeros(60)
+    expected[5] = 1.0
+    with np.errstate(all="raise"):
+        assert leaf_end._unevenness(np.full(100, 5.5), expected, steps) == 1.0
+        uneven = leaf_end._unevenness(np.repeat([5.5, 30.5], 50), expected + 1e-3, steps)
+    assert 1.0 <= uneven < np.inf
