@@ -144,24 +144,25 @@ class Fit:
         lower, upper = np.where(angle, -np.inf, space.lower), np.where(angle, np.inf, space.upper)
         ends = propagated(self._values, self.x, self.trait_covariance, made.quantile, lower, upper)
         off = made.quantile * made.misfit_cm * self.scale
-        changes = np.array([self._values(self.x, thicker=by) for by in (off, -off)]) - self._values(self.x)
-        changes[:, [trait.organ == STEM for trait in self._measured(self.x)]] = 0.0
+        values, measured = self._values(self.x), self._measured(self.x)
+        changes = np.array([self._values(self.x, thicker=by) for by in (off, -off)]) - values
+        changes[:, [trait.organ == STEM for trait in measured]] = 0.0
         ends = ends.with_error(np.minimum(changes, 0.0).min(axis=0), np.maximum(changes, 0.0).max(axis=0))
-        names = np.array([trait.name for trait in self._measured(self.x)])
-        by_width = (names == "leaf_width") * made.quantile * made.width_misfit * self._values(self.x)
-        hidden, leaf = made.sighting.along_stem * self.scale, self._organs_of(self.x)[1]
-        strip = float(leaf.until(hidden / leaf.segment_lengths.sum()).area) if hidden else 0.0
-        further = max(0.0, self._further_down(off) - float(changes[1, names == "leaf_length"][0]))
-        hidden, strip = hidden + further, strip + 2.0 * float(leaf.half_width[0]) * further
-        by_stem = (names == "leaf_length") * hidden + (names == "leaf_area") * strip
+        names = np.array([trait.name for trait in measured])
+        by_width = (names == "leaf_width") * made.quantile * made.width_misfit * values
+        inside, leaf = made.sighting.along_stem * self.scale, self._organs_of(self.x)[1]
+        strip = float(leaf.until(inside / leaf.segment_lengths.sum()).area) if inside else 0.0
+        below = self._further_down(off, float(values[names == "leaf_angle"][0]))
+        below = max(0.0, below - float(changes[1, names == "leaf_length"][0]))
+        strip += 2.0 * float(leaf.half_width[0]) * below
+        by_stem = (names == "leaf_length") * (inside + below) + (names == "leaf_area") * strip
         return ends.with_error(by_width, by_width + by_stem)
 
-    def _further_down(self, off: float) -> float:
-        """How much further down its stem, cm, a leaf may start that lies `off` cm off where it was fitted: it nears the
-        stem as its chord does, below its midrib's start as well."""
-        angle = next(trait.value for trait in self._measured(self.x) if trait.name == "leaf_angle")
-        below = self.parameters["stem_length"]
-        return float(min(below, off / max(np.tan(np.deg2rad(angle)), 1e-9))) if 0.0 < angle < 90.0 else 0.0
+    def _further_down(self, off: float, angle: float) -> float:
+        """How much further down its stem, cm, a leaf at this angle, deg, may start that lies `off` cm off where it was
+        fitted: it nears the stem as its chord does, below its midrib's start as well."""
+        least = np.arctan2(off, self.parameters["stem_length"])  # at which that is all of the stem below it
+        return float(off / np.tan(max(np.deg2rad(angle), least))) if off > 0.0 and angle < 90.0 else 0.0
 
     def _values(self, x: FloatArray, *, thicker: float = 0.0, whole: bool = False) -> FloatArray:
         """Values (t,) of the traits, of a stem with a radius so much larger, of the leaf as it ends, or `whole`."""

@@ -37,9 +37,7 @@ START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some
 CUT_SHARES = (0.85, 0.97)  # of the midrib, from which the search for a missing tip starts; the second of rich leaves
 DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
-SHAPE_PROMISE = (
-    12.0  # nats for which a richer leaf is tried: its fourteen parameters gain seven by chance, and cost more
-)
+SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: fourteen parameters gain seven by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning, or is known of the stem, must fit better
 ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
