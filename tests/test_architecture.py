@@ -33,7 +33,7 @@ LAYERS = [
     {"flags"},
     {"likelihood", "objectives", "pose"},
     {"distances", "hidden"},
-    {"intervals", "optimize", "traits"},
+    {"intervals", "optimize", "traits", "voids"},
     {"species"},
     {"models"},
     {"formats"},

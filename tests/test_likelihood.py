@@ -124,6 +124,7 @@ def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0
         leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, area, np.zeros((m, 9, 0)),
         np.zeros(0),
         stem.axis[:-1], stem.frame, stem.segment_lengths, 0.5 * (stem.half_width[1:] + stem.half_width[:-1]),
+        2.0 * np.pi * stem.segment_lengths @ (0.5 * (stem.half_width[1:] + stem.half_width[:-1])),
         np.zeros((len(stem.frame), 9, 0)), np.zeros(0),
         np.array(facing, float), np.array(noise, float), np.array(share, float), float(outlier_density),
         log_p, np.empty((0, 7)),

@@ -153,7 +153,7 @@ def width_misfit(likelihood: CloudLikelihood, state: State, scores: FloatArray, 
     half = np.interp(place * lengths.sum(), np.concatenate([[0.0], np.cumsum(lengths)]), leaf.half_width)
     ratio, chance = [], []
     hidden = likelihood.hidden
-    whole = np.ones(likelihood.model.n_pieces, bool) if hidden is None else np.all(hidden.share == 0.0, axis=1)
+    whole = np.ones(likelihood.model.n_pieces, bool) if hidden is None else ~hidden.pieces
     for i in range(1, N_PIECES - 2):  # not where stem and tip are
         low, high = (int(np.floor(end * len(whole) / N_PIECES)) for end in (i, i + 1))
         those = (place * N_PIECES).astype(int) == i

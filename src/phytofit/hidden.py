@@ -1,6 +1,6 @@
 """What of a leaf a cloud lacks, as a part of space: points that came to lie there were not seen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from phytofit.models import Organ
+from phytofit.voids import PARTS, Void
 
 __all__ = ["N_STRIPS", "Hidden", "cells"]
 
 FloatArray = NDArray[np.float64]
 N_STRIPS = 9  # of a leaf, along it
+IN_VOID = 0.1  # share not seen, from which a cell lies in a void
 
 
 @dataclass(frozen=True)
@@ -21,11 +23,21 @@ class Hidden:
 
     The leaf's m pieces have nine strips each, from the right edge to the left.  ``share`` (m, 9) are the coefficients
     of a cubic B-spline over these cells: without kinks, as a likelihood should be.  Farther than a cell
-    beyond them it stays as it is there.
+    beyond them it stays as it is there.  ``void``, if there is one, lies around the leaf's base:
+    of the stem nothing was seen there either.
     """
 
     leaf: Organ
     share: FloatArray
+    void: Void | None = None
+
+    @cached_property
+    def pieces(self) -> NDArray[np.bool_]:
+        """Which pieces (m,) of the leaf were not seen whole."""
+        lacking: NDArray[np.bool_] = np.any(self.share > 0.0, axis=1)
+        if self.void is not None:
+            lacking = lacking | np.any(self.void.at(self._centers) > IN_VOID, axis=1)
+        return lacking
 
     @cached_property
     def _middle(self) -> FloatArray:
@@ -56,21 +68,33 @@ class Hidden:
         tangent, lateral = self.leaf.frame[:, :, 0], self.leaf.frame[:, :, 1]
         along = np.einsum("nmbi,mi->nmb", offset, tangent) / self._long[:, np.newaxis]
         across = np.einsum("nmbi,mi->nmb", offset, lateral) / self._wide[:, np.newaxis]
-        return self._at(along + np.arange(len(self.share))[:, np.newaxis], across + np.arange(N_STRIPS))
+        share = self._at(along + np.arange(len(self.share))[:, np.newaxis], across + np.arange(N_STRIPS))
+        if self.void is None:
+            return share
+        step = (self._long[:, np.newaxis] * tangent)[:, np.newaxis]
+        parts = (np.arange(PARTS) + 0.5) / PARTS - 0.5
+        void = np.mean([self.void.at(places + part * step) for part in parts], axis=0)
+        both: FloatArray = 1.0 - (1.0 - share) * (1.0 - void)
+        return both
 
     def at(self, points: FloatArray) -> FloatArray:
-        """Share (n,) not seen of points like these (n, 3)."""
+        """Share (n,) not seen of the leaf's points where these (n, 3) lie; a void takes all points alike, those of no
+        organ as well, and has no part in it."""
         piece, along = self.leaf.nearest(points)
         across = np.einsum("ni,ni->n", points - self.leaf.axis[piece], self.leaf.frame[piece][:, :, 1])
         return self._at(piece + along / self._long[piece] - 0.5, across / self._wide[piece] + 0.5 * (N_STRIPS - 1))
 
+    def without_holes(self) -> "Hidden":
+        """With the void alone."""
+        return replace(self, share=np.zeros_like(self.share))
+
     def smaller(self) -> "Hidden":
-        """With holes that end a cell earlier."""
-        return Hidden(self.leaf, minimum_filter(self.share, 3, mode="nearest"))
+        """With holes that end a cell earlier, and a smaller void."""
+        return Hidden(self.leaf, minimum_filter(self.share, 3, mode="nearest"), self.void and self.void.smaller())
 
     def larger(self) -> "Hidden":
-        """With holes that end a cell later."""
-        return Hidden(self.leaf, maximum_filter(self.share, 3, mode="nearest"))
+        """With holes that end a cell later, and a larger void."""
+        return Hidden(self.leaf, maximum_filter(self.share, 3, mode="nearest"), self.void and self.void.larger())
 
     def _at(self, along: FloatArray, across: FloatArray) -> FloatArray:
         at = np.stack([along, across])

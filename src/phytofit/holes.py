@@ -7,7 +7,8 @@ from scipy.ndimage import binary_dilation, convolve1d
 from phytofit.flags import clearly_lacking, strip_of
 from phytofit.hidden import N_STRIPS, Hidden
 from phytofit.likelihood import CloudLikelihood, State
-from phytofit.models import move
+from phytofit.models import Organ, move
+from phytofit.voids import Void, find_void
 
 __all__ = ["find_holes"]
 
@@ -22,33 +23,49 @@ CLEARLY, FEW_ON_PIECE = 4.0, 3.0  # standard deviations of the number of points;
 EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which its strips are not told apart
 
 
-def find_holes(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Hidden | None:
-    """Where points of the leaf were not seen, None where all were; scores (n, k) of the points as the state gives them.
+def find_holes(
+    likelihood: CloudLikelihood, state: State, scores: FloatArray, void: Void | None = None
+) -> Hidden | None:
+    """Where points of the leaf were not seen, None where all were; scores (n, k) of the points as the state gives them;
+    `void`, if one is known."""
+    on_stem, on_leaf, outlier = state.belongs(scores)
+    stem, leaf = move([organ.row(0) for organ in likelihood.model.organs(state.x)], likelihood.pose_of(state))
+    void = void or find_void(
+        likelihood.points[outlier < 0.5],
+        stem,
+        leaf,
+        n_stem=float(on_stem.sum()),
+        n_leaf=float(on_leaf.sum()),
+        noise_cm=float(state.noise[0]),
+    )
+    share = _lacking_share(likelihood.points[on_leaf > 0.5], stem, leaf, state.noise)
+    return Hidden(leaf, share, void) if void is not None or share.any() else None
+
+
+def _lacking_share(points: FloatArray, stem: Organ, leaf: Organ, noise: FloatArray) -> FloatArray:
+    """Share (m, 9) of the leaf's points (n, 3) that its cells lack, 0 where there is no hole.
 
     A hole has leaf on both sides: what is missing at the tip is another matter, and near the stem it can't be told
     whose the points are.  It may leave a part of the leaf's breadth; a strip that lacks points all along is no hole,
     but a width that is not right yet.
     """
-    on_leaf = state.belongs(scores)[1]
-    stem, leaf = move([organ.row(0) for organ in likelihood.model.organs(state.x)], likelihood.pose_of(state))
-    points = likelihood.points[on_leaf > 0.5]
     half = 0.5 * (leaf.half_width[1:] + leaf.half_width[:-1])
     area = 2.0 * leaf.segment_lengths * half
     m = len(area)
     number = np.bincount(leaf.nearest(points)[0] * N_STRIPS + strip_of(leaf, points, N_STRIPS), minlength=m * N_STRIPS)
     cells = _smoothed(number.reshape(m, N_STRIPS).astype(float), 0)
     wanted = np.repeat(_smoothed(area * len(points) / area.sum(), 0)[:, np.newaxis] / N_STRIPS, N_STRIPS, axis=1)
-    blurred = half <= EDGE_ON * state.noise[1]
+    blurred = half <= EDGE_ON * noise[1]
     density = cells.sum(axis=1) / np.maximum(wanted.sum(axis=1), 1e-9)
     typical = float(np.quantile(density, TYPICAL))
     if typical == 0.0:  # hardly a point is the leaf's
-        return None
+        return np.zeros((m, N_STRIPS))
     wanted *= typical
     found, expected = cells.sum(axis=1), wanted.sum(axis=1)
     ratio = found / np.maximum(expected, 1e-9)
     seen = np.flatnonzero((ratio >= 0.5) & (found >= FEW_ON_PIECE))
     across = (0.5 * (leaf.axis[1:] + leaf.axis[:-1]) - stem.axis[0]) @ stem.frame[0, :, 1:]
-    apart = np.linalg.norm(across, axis=1) > stem.half_width.max() + OFF_STEM * max(state.noise[:2])
+    apart = np.linalg.norm(across, axis=1) > stem.half_width.max() + OFF_STEM * max(noise[:2])
     looked_at = apart & (np.arange(m) < (seen[-1] if len(seen) else 0))
     hole = looked_at & (ratio < HOLE) & (expected - found > CLEARLY * np.sqrt(expected))
     wide = looked_at & ~blurred
@@ -59,7 +76,7 @@ def find_holes(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     lacking &= lacking.mean(axis=0) < 0.5
     lacking |= hole[:, np.newaxis] & (thirds < HOLE * wanted_of_third)
     if not lacking.any():
-        return None
+        return np.zeros((m, N_STRIPS))
     lacking = np.repeat(lacking, N_STRIPS // 3, axis=1)
     missing = 1.0 - _smoothed(cells, 1) / np.maximum(wanted, 1e-9)
     rim = binary_dilation(lacking, np.ones((3, 3))) & looked_at[:, np.newaxis] & (missing > 1.0 - RIM)
@@ -67,7 +84,8 @@ def find_holes(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     little = hole & (ratio < LITTLE)
     share[little] = np.maximum(share[little], 1.0 - ratio[little, np.newaxis])
     share[blurred] = np.where(hole, 1.0 - ratio, 0.0)[blurred, np.newaxis]
-    return Hidden(leaf, np.clip(share, 0.0, MOST_HIDDEN))
+    clipped: FloatArray = np.clip(share, 0.0, MOST_HIDDEN)
+    return clipped
 
 
 def _smoothed(numbers: FloatArray, axis: int) -> FloatArray:

@@ -1,7 +1,7 @@
 """The likelihood of a cloud under a phytomer's surface: each point of the stem, of the leaf, or an outlier."""
 
 import copy
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from phytofit.hidden import Hidden, cells
+from phytofit.hidden import N_STRIPS, Hidden, cells
 from phytofit.kernels.likelihood import CHANGES, log_density, segment_changes
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
+from phytofit.voids import around_stem
 
 __all__ = ["LEAF_NOISE", "NOISE", "OUTLIERS", "SHARES", "SHIFT", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 
@@ -262,7 +263,7 @@ class CloudLikelihood:
         pose[:3, 3] = turn @ (state.pose[:3, 3] - state.center) + state.center + state.shift
         return pose
 
-    def _area(
+    def _leaf_area(
         self, leaf: Organ, length: FloatArray, half: FloatArray, state: State, steps: FloatArray
     ) -> tuple[float, FloatArray]:
         """Area of the leaf, as far as it was seen, and the change (k + 7,) of its logarithm by parameters and pose.
@@ -270,24 +271,43 @@ class CloudLikelihood:
         The leaf is a population as :func:`segment_changes` takes it, in the model's frame; `steps` are empty where the
         change is not wanted.
         """
-        wanted = len(steps) > 0
-        change = np.zeros(len(steps) + 6 if wanted else 0)
         middle = 0.5 * (half[:, 1:] + half[:, :-1])
         whole = 2.0 * length * middle
-        area = whole.sum(axis=1)
-        if self.hidden is not None:
-            pose = self.pose_of(state)
-            places = cells(leaf.axis, leaf.frame, length, middle) @ pose[:3, :3].T + pose[:3, 3]
-            area = np.sum(whole * (1.0 - self.hidden.around_cells(places).mean(axis=2)), axis=1)
-            if wanted:
-                arm = places[0] - state.center - state.shift
-                turned = [np.cross(axis, arm) for axis in _left_jacobian(state.turn).T]
-                moves = POSE_STEP * np.array([*turned, *(np.broadcast_to(axis, arm.shape) for axis in np.eye(3))])
-                share = self.hidden.around_cells(np.concatenate([places[0] + moves, places[0] - moves])).mean(axis=2)
-                change[-6:] = (share[6:] - share[:6]) @ whole[0] / (2.0 * POSE_STEP * area[0])
-        if wanted:
-            change[: len(steps)] = _slope(np.log(area), steps)
-        return float(area[0]), change
+        if self.hidden is None:
+            return _log_change(whole.sum(axis=1), steps)
+        whole = np.repeat(whole[..., np.newaxis] / N_STRIPS, N_STRIPS, axis=2)
+        return self._seen_area(
+            cells(leaf.axis, leaf.frame, length, middle), whole, self.hidden.around_cells, state, steps
+        )
+
+    def _stem_area(self, stem: Organ, state: State, steps: FloatArray) -> tuple[float, FloatArray]:
+        """The same of the stem."""
+        if self.hidden is None or self.hidden.void is None:
+            half = 0.5 * (stem.half_width[:, 1:] + stem.half_width[:, :-1])
+            return _log_change(2.0 * np.pi * np.sum(stem.segment_lengths * half, axis=1), steps)
+        return self._seen_area(*around_stem(stem), self.hidden.void.at, state, steps)
+
+    def _seen_area(
+        self,
+        places: FloatArray,
+        whole: FloatArray,
+        hidden: Callable[[FloatArray], FloatArray],
+        state: State,
+        steps: FloatArray,
+    ) -> tuple[float, FloatArray]:
+        """What is seen of a population's areas (c, ...) around places (c, ..., 3), in the model's frame, of which a
+        share is `hidden`; and the change (k + 7,) of its logarithm."""
+        pose = self.pose_of(state)
+        places = places @ pose[:3, :3].T + pose[:3, 3]
+        rest = tuple(range(1, whole.ndim))
+        area, change = _log_change(np.sum(whole * (1.0 - hidden(places)), axis=rest), steps)
+        if len(steps):
+            arm = places[0] - state.center - state.shift
+            turned = [np.cross(axis, arm) for axis in _left_jacobian(state.turn).T]
+            moves = POSE_STEP * np.array([*turned, *(np.broadcast_to(axis, arm.shape) for axis in np.eye(3))])
+            share = np.sum(whole[0] * hidden(np.concatenate([places[0] + moves, places[0] - moves])), axis=rest)
+            change[-6:] = (share[6:] - share[:6]) / (2.0 * POSE_STEP * area)
+        return area, change
 
     def evaluate(self, state: State, *, derivatives: bool = True) -> Evaluation:
         """The error and, if wanted, the scores (n, k + 14) of a state."""
@@ -305,24 +325,23 @@ class CloudLikelihood:
         pose = self.pose_of(state)
         r, t = pose[:3, :3], pose[:3, 3]
         n_columns = k + 7 if derivatives else 0
-        leaf_area, leaf_area_change = self._area(leaf, length, half, state, steps)
+        leaf_area, leaf_area_change = self._leaf_area(leaf, length, half, state, steps)
+        stem_area, stem_area_change = self._stem_area(stem, state, steps)
         leaf_change = np.empty((leaf.frame.shape[1], CHANGES, n_columns))
         stem_change = np.empty((stem.frame.shape[1], CHANGES, n_columns))
-        stem_area_change = np.zeros(n_columns)
         if derivatives:
             # axes of turning, shifts and centre as the model's frame sees them
             about = r.T @ _left_jacobian(state.turn), r.T, r.T @ (state.center + state.shift - t)
             segment_changes(leaf.axis, leaf.frame, length, half, steps, *about, leaf_change)
             segment_changes(stem.axis, stem.frame, stem_length, stem.half_width, steps, *about, stem_change)
-            stem_area_change[:n_steps] = _slope(np.log(np.sum(stem_length * radius, axis=1)), steps)
         n = len(self.points)
         log_p = np.empty(n)
         scores = np.empty((n if derivatives else 0, k + N_EXTRA))
         arguments = (
             leaf.axis[0, :-1] @ r.T + t, r @ leaf.frame[0], length[0], half[0], leaf_area, leaf_change,
             leaf_area_change,
-            stem.axis[0, :-1] @ r.T + t, r @ stem.frame[0], stem_length[0], radius[0], stem_change,
-            stem_area_change,
+            stem.axis[0, :-1] @ r.T + t, r @ stem.frame[0], stem_length[0], radius[0], stem_area,
+            stem_change, stem_area_change,
             state.facing, state.noise, state.share, self.outlier_density,
         )  # fmt: skip
 
@@ -355,6 +374,14 @@ def _seen(leaf: Organ, share: FloatArray) -> tuple[FloatArray, FloatArray]:
     half = leaf.half_width.copy()
     half[:, 1:] = leaf.half_width[:, :-1] + part * np.diff(leaf.half_width, axis=1)
     return leaf.segment_lengths * part, half
+
+
+def _log_change(area: FloatArray, steps: FloatArray) -> tuple[float, FloatArray]:
+    """The first of areas (c,) of a population as :func:`segment_changes` takes it, and the change (k + 7,) of its
+    logarithm, which the pose does not change; (0,) without steps."""
+    if not len(steps):
+        return float(area[0]), np.zeros(0)
+    return float(area[0]), np.append(_slope(np.log(area), steps), np.zeros(6))
 
 
 def _slope(values: FloatArray, steps: FloatArray) -> FloatArray:

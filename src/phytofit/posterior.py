@@ -39,7 +39,7 @@ DITHER_CM = 0.1  # added to points without noise
 N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: fourteen parameters gain seven by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
-CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning, or is known of the stem, must fit better
+CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning must fit better
 ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
@@ -150,7 +150,11 @@ def _rich(species: Species, cloud: Cloud, simple: End) -> tuple[End, End]:
     cloud = cloud._replace(leaf_noise_cm=float(simple.state.noise[0]))
     part = cloud.part(FEW_POINTS)
     begun = [simple.state, *turned_blade(species, simple.likelihood, simple.state, simple.at.scores)]
-    best = max((refined_end(species, it, part, thick=True) for it in begun), key=lambda end: end.fit_of_points)
+    known = simple.likelihood.hidden
+    void = None if known is None or known.void is None else known.without_holes()
+    best = max(
+        (refined_end(species, it, part, thick=True, hidden=void) for it in begun), key=lambda end: end.fit_of_points
+    )
     best = _elsewhere(species, part, best, LOWER_ROUNDS)
     best = refined_end(species, best.state, cloud, thick=True, hidden=best.likelihood.hidden)
     best = _elsewhere(species, cloud, best, 1)
@@ -230,7 +234,7 @@ def _one_sided(chosen: Chosen) -> Chosen:
         return chosen
     end = End(free, there, free.evaluate(there), refined.converged)
     lead = evidence_of(end, chosen.dependence.inflation) - evidence_of(chosen.end, chosen.dependence.inflation)
-    if lead < CLEARLY_BETTER:
+    if lead < 0.0:
         return chosen
     return chosen._replace(end=end, dependence=score_dependence(free, there))
 

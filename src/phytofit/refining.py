@@ -75,7 +75,11 @@ def refined_end(
     cut: bool = False,
     hidden: Hidden | None = None,
 ) -> End:
-    """Where the state leads to; `hidden` is what is known before of what was not seen."""
+    """Where the state leads to; `hidden` is what is known before of what was not seen.
+
+    A void that is known stays: what is more probable beside a larger one is not the better for it.
+    """
+    void = None if hidden is None else hidden.void
     for number in range(HOLE_ROUNDS):
         likelihood = cloud.likelihood(species, thick=thick, cut=cut, hidden=hidden)
         state = likelihood.extended(state)
@@ -85,7 +89,7 @@ def refined_end(
         end = refinement(likelihood, state)
         state = State(end.theta, state.pose, state.center)
         at = likelihood.evaluate(state)
-        hidden = find_holes(likelihood, state, at.scores)
+        hidden = find_holes(likelihood, state, at.scores, void)
         if _alike(hidden, likelihood.hidden):
             break
     return End(likelihood, state, at, end.converged)
@@ -94,7 +98,11 @@ def refined_end(
 def _alike(one: Hidden | None, other: Hidden | None) -> bool:
     if one is None or other is None:
         return one is other
-    return bool(np.abs(one.share - other.share).max() <= SAME_SHARE)
+    if one.void is None or other.void is None:
+        same = one.void is other.void
+    else:
+        same = abs(one.void.radius - other.void.radius) <= SAME_SHARE * one.void.radius
+    return same and bool(np.abs(one.share - other.share).max() <= SAME_SHARE)
 
 
 def refinement(likelihood: CloudLikelihood, state: State, **limits: Any) -> Refined:

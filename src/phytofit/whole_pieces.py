@@ -28,7 +28,7 @@ def of_whole_pieces(likelihood: CloudLikelihood, state: State) -> CloudLikelihoo
     hidden = likelihood.hidden
     if hidden is None:
         return None
-    left_out = binary_dilation(np.any(hidden.share > 0.0, axis=1), np.ones(3))
+    left_out = binary_dilation(hidden.pieces, np.ones(3))
     if np.mean(~left_out & (np.arange(len(left_out)) < state.seen * len(left_out))) < LEAST_WHOLE:
         return None
     kept = ~left_out[hidden.leaf.nearest(likelihood.points)[0]]

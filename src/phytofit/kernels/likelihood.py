@@ -83,7 +83,7 @@ def _normal(z):
 def log_density(
     points, organ, seen,
     leaf_origin, leaf_frame, leaf_length, leaf_half, leaf_area, leaf_change, leaf_area_change,
-    stem_origin, stem_frame, stem_length, stem_radius, stem_change, stem_area_change,
+    stem_origin, stem_frame, stem_length, stem_radius, stem_area, stem_change, stem_area_change,
     facing, noise, share, outlier_density,
     log_p, scores,
 ):  # fmt: skip
@@ -105,6 +105,7 @@ def log_density(
     leaf_area : of the leaf, as far as it was seen
     stem_origin (s, 3), stem_frame (s, 3, 3) columns tangent and two across, stem_length (s,), stem_radius (s,) : the
         stem's segments
+    stem_area : of the stem, as far as it was seen
     leaf_change (m, 9, k), leaf_area_change (k,), stem_change (s, 9, k), stem_area_change (k,) : change of a segment,
         in its own frame, and of the logarithm of the organ's area, for a unit change of each
         of k parameters
@@ -125,9 +126,6 @@ def log_density(
     far, reach, depth = REACH * stem_noise, REACH * leaf_noise, REACH * thickness
     stem_square, leaf_square = stem_noise * stem_noise, leaf_noise * leaf_noise
     thin = leaf_square / (thickness * thickness)
-    stem_area = 0.0
-    for j in range(len(stem_length)):
-        stem_area += stem_length[j] * stem_radius[j]
     floor = share[2] * outlier_density
     facing_v, facing_w = facing[0], facing[1]
     one_sided = np.sqrt(facing_v * facing_v + facing_w * facing_w)
@@ -167,7 +165,7 @@ def log_density(
                 gap = rho - radius
                 exponent = pull - rho * radius / stem_square - one_sided - 0.5 * gap * gap / stem_square
                 around = np.exp(exponent) * bessel / (2.0 * np.pi * stem_square * at_all_sides)
-                density = share[0] * radius / stem_area * around * along
+                density = share[0] * 2.0 * np.pi * radius / stem_area * around * along
                 if density <= 0.0:
                     continue
                 on_stem += density
