@@ -18,6 +18,7 @@ from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import LEAF, STEM, Organ, Phytomer, SurfaceSampler, move
 from phytofit.models.organs import frames_along
 from phytofit.species import load_species
+from phytofit.voids import Void
 
 EXACT = 1e-9  # relative; sums in float64
 BESSEL = 1e-6  # relative; the tube's Bessel function is a polynomial, good to a few 1e-7
@@ -488,6 +489,19 @@ def test_what_was_not_seen_takes_no_part_of_the_leaf():
     hidden = Hidden(leaf, np.random.default_rng(9).uniform(0.0, 0.98, (30, 9)))
     likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, whole.points, thick=True, hidden=hidden)
     assert_scores_are_slopes(likelihood, disturbed(likelihood, state, np.random.default_rng(8)))
+
+
+@pytest.mark.parametrize("facing", [(0.0, 0.0), (0.8, -1.3)])
+def test_scores_are_slopes_beside_a_void(facing):
+    whole, state = scene(SHAPED, 8, n=60)
+    leaf = move(grow(state.x), whole.pose_of(state))[1]
+    void = Void(leaf.axis[0] + np.array([0.3, -0.2, 0.5]), 2.0, 0.6)
+    hidden = Hidden(leaf, np.zeros((30, 9)), void)
+    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, whole.points, thick=True, hidden=hidden).one_sided()
+    state = disturbed(likelihood, state, np.random.default_rng(8))
+    theta = state.theta.copy()
+    theta[-7:-5] = facing
+    assert_scores_are_slopes(likelihood, at(state, theta))
 
 
 def test_a_part_of_a_piece_may_be_missing(clean):

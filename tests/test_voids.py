@@ -1,7 +1,10 @@
 """The space around a leaf's base of which nothing was seen, and that it takes neither angle nor diameter along."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import phytofit
 from phytofit.hidden import Hidden
@@ -33,7 +36,7 @@ def void_in(true, points):
     likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points)
     state = likelihood.start(true.x[:7], true.pose, NOISE_CM)
     state.theta[-2] = np.log(0.4)
-    hidden = find_holes(likelihood, state, likelihood.evaluate(state).scores)
+    hidden = find_holes(likelihood, state, likelihood.evaluate(state).scores, find=True)
     return None if hidden is None else hidden.void
 
 
@@ -54,6 +57,26 @@ def test_nothing_is_missing_of_what_was_seen_whole(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
+def test_the_back_of_a_stem_that_was_seen_from_one_side_is_no_void(seed):
+    true = made(seed)
+    upright = (true.points - true.pose[:3, 3]) @ true.pose[:3, :3]
+    behind = (true.labels == 1) & (upright @ np.array([0.6, 0.8, 0.0]) > 0.0)
+    assert void_in(true, true.points[~behind]) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_same_ball_is_found_however_the_cloud_lies(seed):
+    true = made(seed)
+    points = without_ball(true, around_base(true, seed))
+    turn = Rotation.random(random_state=seed).as_matrix()
+    there = replace(true, pose=np.vstack([turn @ true.pose[:3], true.pose[3:]]))
+    void, turned = void_in(true, points), void_in(there, points @ turn.T)
+    np.testing.assert_allclose(turned.center, turn @ void.center, atol=1e-6)
+    assert turned.radius == pytest.approx(void.radius, abs=1e-6)
+    assert np.count_nonzero(np.linalg.norm(points - void.center, axis=1) < 0.999 * void.radius) <= 2
+
+
+@pytest.mark.parametrize("seed", range(4))
 def test_a_hole_in_the_leaf_is_not_one_around_its_base(seed):
     true = made(seed)
     assert void_in(true, without_ball(true, true.organs[1].axis[15])) is None
@@ -63,7 +86,9 @@ def test_the_edge_is_half_seen_and_blurred():
     void = Void(np.array([1.0, 2.0, 3.0]), 2.0, 0.5)
     outward = np.array([0.0, 0.6, 0.8])
     places = void.center + np.array([0.0, 1.5, 2.0, 2.5])[:, np.newaxis] * outward
-    np.testing.assert_allclose(void.at(places), [0.99997, 0.84134, 0.5, 0.15866], atol=1e-5)  # normal quantiles
+    np.testing.assert_allclose(
+        void.at(places), 0.98 * np.array([0.99997, 0.84134, 0.5, 0.15866]), atol=1e-5
+    )  # normal quantiles
     assert void.smaller().at(places[2]) < 0.2
     assert void.larger().at(places[2]) > 0.8
 
@@ -101,7 +126,7 @@ def test_what_is_left_is_denser_by_what_the_void_takes_of_each_organ():
             at = likelihood.evaluate(state, derivatives=False)
             density.append(np.exp(at.log_p) - likelihood.outlier_density * state.share[2])
         near = density[0] > 0.01 * density[0].max()
-        np.testing.assert_allclose((density[1] / density[0])[near], 1.0 / (1.0 - taken), rtol=0.01)
+        np.testing.assert_allclose((density[1] / density[0])[near], 1.0 / (1.0 - 0.98 * taken), rtol=0.01)
 
 
 @pytest.mark.parametrize("seed", range(6))

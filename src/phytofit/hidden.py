@@ -84,6 +84,11 @@ class Hidden:
         across = np.einsum("ni,ni->n", points - self.leaf.axis[piece], self.leaf.frame[piece][:, :, 1])
         return self._at(piece + along / self._long[piece] - 0.5, across / self._wide[piece] + 0.5 * (N_STRIPS - 1))
 
+    def around(self, places: FloatArray) -> FloatArray:
+        """Share (n,) not seen of the leaf's points from places (n, 3) on it, by holes and void."""
+        seen = 1.0 - self.at(places)
+        return 1.0 - (seen if self.void is None else seen * (1.0 - self.void.at(places)))
+
     def without_holes(self) -> "Hidden":
         """With the void alone."""
         return replace(self, share=np.zeros_like(self.share))

@@ -24,20 +24,14 @@ EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which its strips are 
 
 
 def find_holes(
-    likelihood: CloudLikelihood, state: State, scores: FloatArray, void: Void | None = None
+    likelihood: CloudLikelihood, state: State, scores: FloatArray, void: Void | None = None, *, find: bool = False
 ) -> Hidden | None:
-    """Where points of the leaf were not seen, None where all were; scores (n, k) of the points as the state gives them;
-    `void`, if one is known."""
-    on_stem, on_leaf, outlier = state.belongs(scores)
+    """Where points of the leaf were not seen, None where all were; scores (n, k) of the points as the state gives them.
+    The `void` around its base is the one that is known, or a better one if it is to `find` it."""
+    on_stem, on_leaf, _ = state.belongs(scores)
     stem, leaf = move([organ.row(0) for organ in likelihood.model.organs(state.x)], likelihood.pose_of(state))
-    void = void or find_void(
-        likelihood.points[outlier < 0.5],
-        stem,
-        leaf,
-        n_stem=float(on_stem.sum()),
-        n_leaf=float(on_leaf.sum()),
-        noise_cm=float(state.noise[0]),
-    )
+    if find:
+        void = find_void(likelihood.points, on_stem > 0.5, stem, leaf, noise_cm=float(state.noise[0])) or void
     share = _lacking_share(likelihood.points[on_leaf > 0.5], stem, leaf, state.noise)
     return Hidden(leaf, share, void) if void is not None or share.any() else None
 

@@ -151,7 +151,7 @@ def _seen_along(likelihood: CloudLikelihood, state: State, at: FloatArray) -> Fl
     middle = leaf.axis[piece] + (at - nodes[piece])[:, np.newaxis] * leaf.frame[piece][:, :, 0]
     half = np.interp(at, nodes, leaf.half_width)
     across = [middle + (share * half)[:, np.newaxis] * leaf.frame[piece][:, :, 1] for share in ACROSS]
-    hidden = np.mean([likelihood.hidden.at(places) for places in across], axis=0)
+    hidden = np.mean([likelihood.hidden.around(places) for places in across], axis=0)
     seen: FloatArray = np.maximum(1.0 - hidden, LEAST_SEEN)
     return seen
 

@@ -14,7 +14,7 @@ from phytofit.hidden import N_STRIPS, Hidden, cells
 from phytofit.kernels.likelihood import CHANGES, log_density, segment_changes
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
-from phytofit.voids import around_stem
+from phytofit.voids import around_stem, facing_share
 
 __all__ = ["LEAF_NOISE", "NOISE", "OUTLIERS", "SHARES", "SHIFT", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 
@@ -285,7 +285,20 @@ class CloudLikelihood:
         if self.hidden is None or self.hidden.void is None:
             half = 0.5 * (stem.half_width[:, 1:] + stem.half_width[:, :-1])
             return _log_change(2.0 * np.pi * np.sum(stem.segment_lengths * half, axis=1), steps)
-        return self._seen_area(*around_stem(stem), self.hidden.void.at, state, steps)
+        places, area = around_stem(stem)
+        return self._seen_area(places, area * facing_share(state.facing), self.hidden.void.at, state, steps)
+
+    def _by_facing(self, stem: Organ, state: State) -> FloatArray:
+        """Change (2,) of the logarithm of the stem's seen area by where its points face."""
+        if self.hidden is None or self.hidden.void is None:
+            return np.zeros(2)
+        places, area = around_stem(Organ(stem.kind, stem.axis[:1], stem.frame[:1], stem.half_width[:1]))
+        pose = self.pose_of(state)
+        seen = (area * (1.0 - self.hidden.void.at(places @ pose[:3, :3].T + pose[:3, 3]))).sum(axis=(0, 1))
+        moves = POSE_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        log = np.log([float(seen @ facing_share(state.facing + move)) for move in moves])
+        change: FloatArray = (log[::2] - log[1::2]) / (2.0 * POSE_STEP)
+        return change
 
     def _seen_area(
         self,
@@ -353,6 +366,8 @@ class CloudLikelihood:
         done: Iterable[None] = map(block, firsts) if self._executor is None else self._executor.map(block, firsts)
         for _ in done:
             pass
+        if derivatives:
+            scores[:, FACING] -= np.outer(scores[:, -2] + state.share[0], self._by_facing(stem, state))
         prior = 0.5 * float(np.sum((state.theta - self.mean) ** 2 * self.precision))
         return Evaluation(prior - float(log_p.sum() if self.weights is None else self.weights @ log_p), scores, log_p)
 

@@ -21,7 +21,17 @@ from phytofit.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, Sta
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.outcome import Chosen, Elsewhere, Estimate, outcome
-from phytofit.refining import COARSE_TOLERANCE, FEW_POINTS, Cloud, End, evidence_of, refined_end, refinement, terms
+from phytofit.refining import (
+    COARSE_TOLERANCE,
+    FEW_POINTS,
+    Cloud,
+    End,
+    evidence_of,
+    refined_end,
+    refinement,
+    terms,
+    void_of,
+)
 from phytofit.species import Species
 from phytofit.tip import gain_of_blunt_end
 
@@ -133,15 +143,20 @@ def _drawn_in(plain: Species, cloud: Cloud, begun: Sequence[tuple[FloatArray, Fl
 def _candidates(plain: Species, species: Species, cloud: Cloud, state: State) -> list[End]:
     """Refined: the paper's model, the same with its tip missing, and, if they promise enough, the two with all
     parameters of the species."""
-    found = [refined_end(plain, state, cloud)]
+    found = [refined_end(plain, state, cloud, find_void=True)]
     hidden = found[0].likelihood.hidden
     found.append(refined_end(plain, _cut(found[0].state), cloud, cut=True, hidden=hidden))
     if len(plain.space) == len(species.space):
         return found
     simple = found[1] if found[1].fit_of_points - found[0].fit_of_points > TIP_MISSING else found[0]
-    if _promise(species, simple, cloud) > SHAPE_PROMISE:
-        found += _rich(species, cloud, found[0])
-    return found
+    if _promise(species, simple, cloud) <= SHAPE_PROMISE:
+        return found
+    rich = _rich(species, cloud, found[0])
+    hidden = rich[0].likelihood.hidden
+    if hidden is not None and void_of(hidden) is not void_of(found[0].likelihood.hidden):  # all are to have the same
+        hidden = hidden.without_holes()
+        found = [refined_end(plain, it.state, cloud, cut=i == 1, hidden=hidden) for i, it in enumerate(found)]
+    return [*found, *rich]
 
 
 def _rich(species: Species, cloud: Cloud, simple: End) -> tuple[End, End]:
@@ -156,7 +171,7 @@ def _rich(species: Species, cloud: Cloud, simple: End) -> tuple[End, End]:
         (refined_end(species, it, part, thick=True, hidden=void) for it in begun), key=lambda end: end.fit_of_points
     )
     best = _elsewhere(species, part, best, LOWER_ROUNDS)
-    best = refined_end(species, best.state, cloud, thick=True, hidden=best.likelihood.hidden)
+    best = refined_end(species, best.state, cloud, thick=True, hidden=best.likelihood.hidden, find_void=True)
     best = _elsewhere(species, cloud, best, 1)
     hidden = best.likelihood.hidden
     begun = [_cut(best.state, share) for share in CUT_SHARES]
@@ -226,7 +241,7 @@ def _choice(found: Sequence[End]) -> Chosen:
 
 
 def _one_sided(chosen: Chosen) -> Chosen:
-    """Of a stem that was seen from one side, the fit that knows it, where that is clearly so."""
+    """Of a stem that was seen from one side, the fit that knows it, where it has more evidence."""
     free = chosen.end.likelihood.one_sided()
     refined = refinement(free, chosen.end.state)
     there = free.with_theta(chosen.end.state, refined.theta)

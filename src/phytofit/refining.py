@@ -11,8 +11,19 @@ from phytofit.holes import find_holes
 from phytofit.likelihood import CloudLikelihood, Evaluation, State
 from phytofit.optimize import Refined, refine
 from phytofit.species import Species
+from phytofit.voids import Void
 
-__all__ = ["COARSE_TOLERANCE", "FEW_POINTS", "Cloud", "End", "evidence_of", "refined_end", "refinement", "terms"]
+__all__ = [
+    "COARSE_TOLERANCE",
+    "FEW_POINTS",
+    "Cloud",
+    "End",
+    "evidence_of",
+    "refined_end",
+    "refinement",
+    "terms",
+    "void_of",
+]
 
 FloatArray = NDArray[np.float64]
 FEW_POINTS = 1250  # with which a refinement begins, and which decide from where a richer leaf is begun
@@ -74,12 +85,13 @@ def refined_end(
     thick: bool = False,
     cut: bool = False,
     hidden: Hidden | None = None,
+    find_void: bool = False,
 ) -> End:
     """Where the state leads to; `hidden` is what is known before of what was not seen.
 
-    A void that is known stays: what is more probable beside a larger one is not the better for it.
+    A void around the leaf's base stays as it is unless it is to `find_void`: of models that are compared all must have
+    the same, for points are always denser beside a larger one.
     """
-    void = None if hidden is None else hidden.void
     for number in range(HOLE_ROUNDS):
         likelihood = cloud.likelihood(species, thick=thick, cut=cut, hidden=hidden)
         state = likelihood.extended(state)
@@ -89,10 +101,15 @@ def refined_end(
         end = refinement(likelihood, state)
         state = State(end.theta, state.pose, state.center)
         at = likelihood.evaluate(state)
-        hidden = find_holes(likelihood, state, at.scores, void)
+        hidden = find_holes(likelihood, state, at.scores, void_of(hidden), find=find_void)
         if _alike(hidden, likelihood.hidden):
             break
     return End(likelihood, state, at, end.converged)
+
+
+def void_of(hidden: Hidden | None) -> Void | None:
+    """The void of what was not seen, if there is one."""
+    return None if hidden is None else hidden.void
 
 
 def _alike(one: Hidden | None, other: Hidden | None) -> bool:
@@ -101,7 +118,8 @@ def _alike(one: Hidden | None, other: Hidden | None) -> bool:
     if one.void is None or other.void is None:
         same = one.void is other.void
     else:
-        same = abs(one.void.radius - other.void.radius) <= SAME_SHARE * one.void.radius
+        apart = float(np.linalg.norm(one.void.center - other.void.center))
+        same = max(apart, abs(one.void.radius - other.void.radius)) <= SAME_SHARE * one.void.radius
     return same and bool(np.abs(one.share - other.share).max() <= SAME_SHARE)
 
 

@@ -10,10 +10,11 @@ from scipy.special import ndtr
 
 from phytofit.models import Organ
 
-__all__ = ["PARTS", "Void", "around_stem", "find_void"]
+__all__ = ["PARTS", "Void", "around_stem", "facing_share", "find_void"]
 
 FloatArray = NDArray[np.float64]
 PARTS = 3  # of a piece of the leaf, along it, in which a void is sampled
+MOST = 0.98  # of what is in a void is not seen: some of an organ always is
 SPREAD = 0.25  # of its radius, by which a void may be smaller or larger
 REACH_CM, STEP_CM = 4.0, 0.25  # from the leaf's base, so far is looked; between places on the organs' surfaces
 N_ALONG, N_AROUND, N_ACROSS = 80, 12, 9  # places along the stem, around it, across the leaf
@@ -25,7 +26,7 @@ WELL_INSIDE = 1.5  # noise levels, by which they come from within it
 
 class Void(NamedTuple):
     """A ball of which nothing was seen, neither stem nor leaf: its centre (3,), and cm: its radius, and the standard
-    deviation of its edge, which is blurred by the points' noise and for the steps in which organs are sampled."""
+    deviation of its edge, which is blurred by the stem's noise and for the steps in which organs are sampled."""
 
     center: FloatArray
     radius: float
@@ -33,7 +34,7 @@ class Void(NamedTuple):
 
     def at(self, places: FloatArray) -> FloatArray:
         """Share (...,) not seen of points from places (..., 3)."""
-        share: FloatArray = ndtr((self.radius - np.linalg.norm(places - self.center, axis=-1)) / self.edge)
+        share: FloatArray = MOST * ndtr((self.radius - np.linalg.norm(places - self.center, axis=-1)) / self.edge)
         return share
 
     def smaller(self) -> "Void":
@@ -46,39 +47,49 @@ class Void(NamedTuple):
 
 
 def find_void(
-    points: FloatArray, stem: Organ, leaf: Organ, *, n_stem: float, n_leaf: float, noise_cm: float
+    points: FloatArray, on_stem: NDArray[np.bool_], stem: Organ, leaf: Organ, *, noise_cm: float
 ) -> Void | None:
-    """The ball around the leaf's base that holds next to none of the points (n, 3), but would most of them as the
-    organs have them, `n_stem` and `n_leaf` spread evenly; None where no such ball misses many of the stem's."""
-    base, near = leaf.axis[0], 2.0 * REACH_CM
+    """The ball near the leaf's base that holds next to none of the points (n, 3), but would most of them as the organs
+    have them, evenly along each; None where no such ball misses many of those on the stem (n,).
+
+    Around the stem they are expected where they are: the back of a stem that was seen from one side is no void.
+    """
+    base, near = leaf.axis[0], REACH_CM + sum(reach for reach, _ in GRIDS) * np.sqrt(3.0)
     those = points[np.linalg.norm(points - base, axis=1) < near]
-    if len(those) <= STRAY:
+    if len(those) <= STRAY or not on_stem.any():
         return None
     places, area = around_stem(
         Organ(stem.kind, stem.axis[np.newaxis], stem.frame[np.newaxis], stem.half_width[np.newaxis])
     )
+    from_axis = (points[on_stem] - stem.axis[0]) @ stem.frame[0, :, 1:]
+    angle = np.arctan2(from_axis[:, 1], from_axis[:, 0]) / (2.0 * np.pi) * N_AROUND
+    sector = np.bincount(np.round(angle).astype(int) % N_AROUND, minlength=N_AROUND)
+    of_stem = area * N_AROUND * sector / area.sum()
     close = np.linalg.norm(places - base, axis=-1) < near
-    on_stem, of_stem = places[close], area[close] / area.sum()
-    on_leaf, of_leaf = _across_leaf(leaf)
+    stem_places, of_stem = places[close], of_stem[close]
+    leaf_places, of_leaf = _across_leaf(leaf)
+    of_leaf = of_leaf * np.count_nonzero(~on_stem)
     tree = cKDTree(those)
     center, radius, missing = base, 0.0, 0.0
     for reach, n in GRIDS:
         grid = np.linspace(-reach, reach, n)
-        centers = center + np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1).reshape(-1, 3)
+        offset = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1).reshape(-1, 3)
+        centers = center + offset[np.linalg.norm(offset, axis=1) <= reach] @ stem.frame[0].T
         radii = np.minimum(tree.query(centers, k=STRAY + 1)[0][:, -1], REACH_CM)
         inside = radii[:, np.newaxis] - WELL_INSIDE * noise_cm
-        from_stem = n_stem * (cdist(centers, on_stem) < inside) @ of_stem
-        both = from_stem + n_leaf * (cdist(centers, on_leaf) < inside) @ of_leaf
-        best = int(np.argmax(both))
+        from_stem = (cdist(centers, stem_places) < inside) @ of_stem
+        best = int(np.argmax(from_stem + (cdist(centers, leaf_places) < inside) @ of_leaf))
         center, radius, missing = centers[best], float(radii[best]), float(from_stem[best])
     if missing < MISSING:
         return None
-    edge = np.hypot(noise_cm, 0.5 * leaf.segment_lengths.max() / PARTS)
-    return Void(center, radius, float(edge))
+    length = float(stem.segment_lengths.sum())
+    steps = leaf.segment_lengths.max() / PARTS, length / N_ALONG, 2.0 * np.pi * stem.half_width.max() / N_AROUND
+    return Void(center, radius, float(np.hypot(noise_cm, 0.5 * max(steps))))
 
 
 def around_stem(stem: Organ) -> tuple[FloatArray, FloatArray]:
-    """Places (c, 80, 12, 3) on the stems of a population, and the area (c, 80, 12) around each."""
+    """Places (c, 80, 12, 3) on the stems of a population, the first on the side of its frame's second column, and the
+    area (c, 80, 12) around each."""
     long = stem.segment_lengths
     before = np.concatenate([np.zeros((len(long), 1)), np.cumsum(long, axis=1)], axis=1)
     share = (np.arange(N_ALONG) + 0.5) / N_ALONG
@@ -91,6 +102,15 @@ def around_stem(stem: Organ) -> tuple[FloatArray, FloatArray]:
     places = middle[:, :, np.newaxis] + radius[..., np.newaxis, np.newaxis] * ring[:, np.newaxis]
     area = 2.0 * np.pi / N_AROUND * radius * before[:, -1:] / N_ALONG
     return places, np.repeat(area[..., np.newaxis], N_AROUND, axis=2)
+
+
+def facing_share(facing: FloatArray) -> FloatArray:
+    """Density (12,) of points at the places around a stem, beside that of a stem seen from all sides: von Mises, with
+    the concentration `facing` (2,) towards a side."""
+    angle = 2.0 * np.pi * np.arange(N_AROUND) / N_AROUND
+    density = np.exp(np.cos(angle) * facing[0] + np.sin(angle) * facing[1])
+    share: FloatArray = density / density.mean()
+    return share
 
 
 def _across_leaf(leaf: Organ) -> tuple[FloatArray, FloatArray]:

@@ -26,13 +26,13 @@ def of_whole_pieces(likelihood: CloudLikelihood, state: State) -> CloudLikelihoo
     which is not known well, has no part in it.
     """
     hidden = likelihood.hidden
-    if hidden is None:
+    if hidden is None or not hidden.share.any():
         return None
-    left_out = binary_dilation(hidden.pieces, np.ones(3))
+    left_out = binary_dilation(np.any(hidden.share > 0.0, axis=1), np.ones(3))
     if np.mean(~left_out & (np.arange(len(left_out)) < state.seen * len(left_out))) < LEAST_WHOLE:
         return None
     kept = ~left_out[hidden.leaf.nearest(likelihood.points)[0]]
-    others = Hidden(hidden.leaf, np.repeat(left_out[:, np.newaxis].astype(float), N_STRIPS, axis=1))
+    others = Hidden(hidden.leaf, np.repeat(left_out[:, np.newaxis].astype(float), N_STRIPS, axis=1), hidden.void)
     free = np.zeros(len(state.theta), bool)
     free[: state.n_parameters] = np.isin(likelihood.space.names, WIDTHS)
     free[LEAF_NOISE] = free[SHARES] = True
