@@ -36,7 +36,7 @@ def void_in(true, points):
     likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points)
     state = likelihood.start(true.x[:7], true.pose, NOISE_CM)
     state.theta[-2] = np.log(0.4)
-    hidden = find_holes(likelihood, state, likelihood.evaluate(state).scores, find=True)
+    hidden = find_holes(likelihood, state, likelihood.evaluate(state).scores, with_void=True)
     return None if hidden is None else hidden.void
 
 

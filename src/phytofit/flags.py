@@ -25,7 +25,7 @@ FEW_FOR_SHAPE = 200.0  # points, fewer than which tell little of a leaf with a s
 N_SECTORS = 12  # around the stem
 ROUND = 0.7  # share of them that must be seen
 BASE_SECTIONS = 2  # the leaf's first tenth
-HALF = 0.5  # share of what is around a leaf's base that is not seen, from which that is hidden
+HIDDEN_BASE = 0.5  # share of what is around a leaf's base that is not seen, from which that is hidden
 END_SECTIONS = 3  # narrow: noise blurs them
 GAP, EMPTY, MANY_GAPS = 0.4, 0.1, 0.1  # of the typical number of points, twice; share of the blade
 FEW_ON_STEM = 60  # points
@@ -56,8 +56,8 @@ class Sighting:
     other parts have; ``beyond`` number of points near the leaf's tip that are of no organ, 0 if there are not more than
     by chance; ``end`` share of the midrib at which the leaf's last point lies, and ``short`` how many more would be
     expected beyond it; ``along_stem`` cm of the midrib that lie inside the stem, but so near its surface that they may
-    as well be outside; ``leaf_points`` number of points on the leaf; ``base`` whether anything was seen
-    around its base.
+    as well be outside; ``leaf_points`` number of points on the leaf; ``base`` whether no void lies around its
+    start.
     """
 
     sections: FloatArray
@@ -96,8 +96,7 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
     end = float(across_leaf(likelihood, state)[0][on_leaf > 0.5].max(initial=0.0))
     short = float(on_leaf.sum() * (1.0 - place[on_leaf > 0.5].max(initial=0.0)))
     risen = along_stem(likelihood, state)
-    void = None if likelihood.hidden is None else likelihood.hidden.void
-    start = pose[:3, :3] @ leaf.axis[0] + pose[:3, 3]
+    void, start = likelihood.void, pose[:3, :3] @ leaf.axis[0] + pose[:3, 3]
     return Sighting(
         found / typical,
         float(on_stem.sum()),
@@ -108,7 +107,7 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
         short,
         risen,
         float(on_leaf.sum()),
-        void is None or bool(void.at(start) < HALF),
+        void is None or bool(void.at(start) < HIDDEN_BASE),
     )
 
 

@@ -8,7 +8,7 @@ from phytofit.flags import clearly_lacking, strip_of
 from phytofit.hidden import N_STRIPS, Hidden
 from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import Organ, move
-from phytofit.voids import Void, find_void
+from phytofit.voids import find_void
 
 __all__ = ["find_holes"]
 
@@ -24,13 +24,14 @@ EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which its strips are 
 
 
 def find_holes(
-    likelihood: CloudLikelihood, state: State, scores: FloatArray, void: Void | None = None, *, find: bool = False
+    likelihood: CloudLikelihood, state: State, scores: FloatArray, *, with_void: bool = False
 ) -> Hidden | None:
     """Where points of the leaf were not seen, None where all were; scores (n, k) of the points as the state gives them.
-    The `void` around its base is the one that is known, or a better one if it is to `find` it."""
+    The void around its base is the one that the likelihood knows; `with_void`, one that is found anew, if there is."""
     on_stem, on_leaf, _ = state.belongs(scores)
     stem, leaf = move([organ.row(0) for organ in likelihood.model.organs(state.x)], likelihood.pose_of(state))
-    if find:
+    void = likelihood.void
+    if with_void:
         void = find_void(likelihood.points, on_stem > 0.5, stem, leaf, noise_cm=float(state.noise[0])) or void
     share = _lacking_share(likelihood.points[on_leaf > 0.5], stem, leaf, state.noise)
     return Hidden(leaf, share, void) if void is not None or share.any() else None

@@ -14,7 +14,7 @@ from phytofit.hidden import N_STRIPS, Hidden, cells
 from phytofit.kernels.likelihood import CHANGES, log_density, segment_changes
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
-from phytofit.voids import around_stem, facing_share
+from phytofit.voids import Void, around_stem, facing_share
 
 __all__ = ["LEAF_NOISE", "NOISE", "OUTLIERS", "SHARES", "SHIFT", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 
@@ -126,7 +126,7 @@ class CloudLikelihood:
     weights : (n,) of the points; None: all 1
     thick : whether the leaf may have a thickness, which widens the noise across the blade
     cut : whether the leaf's tip may be missing
-    hidden : where points of the leaf were not seen; None: nowhere
+    hidden : where points of the leaf were not seen, and around its base those of both organs; None: nowhere
     leaf_noise_cm : about that of the leaf's points, which few of them can't tell from its shape; None: not known
     """
 
@@ -245,6 +245,11 @@ class CloudLikelihood:
         return State(theta, state.pose, state.center)
 
     @property
+    def void(self) -> Void | None:
+        """The ball around the leaf's base of which nothing was seen, if there is one."""
+        return None if self.hidden is None else self.hidden.void
+
+    @property
     def free(self) -> NDArray[np.bool_]:
         """Which entries (k + 14,) of theta are not held fixed."""
         return self.lower < self.upper
@@ -282,19 +287,17 @@ class CloudLikelihood:
 
     def _stem_area(self, stem: Organ, state: State, steps: FloatArray) -> tuple[float, FloatArray]:
         """The same of the stem."""
-        if self.hidden is None or self.hidden.void is None:
+        if self.void is None:
             half = 0.5 * (stem.half_width[:, 1:] + stem.half_width[:, :-1])
             return _log_change(2.0 * np.pi * np.sum(stem.segment_lengths * half, axis=1), steps)
         places, area = around_stem(stem)
-        return self._seen_area(places, area * facing_share(state.facing), self.hidden.void.at, state, steps)
+        return self._seen_area(places, area * facing_share(state.facing), self.void.at, state, steps)
 
-    def _by_facing(self, stem: Organ, state: State) -> FloatArray:
-        """Change (2,) of the logarithm of the stem's seen area by where its points face."""
-        if self.hidden is None or self.hidden.void is None:
-            return np.zeros(2)
-        places, area = around_stem(Organ(stem.kind, stem.axis[:1], stem.frame[:1], stem.half_width[:1]))
+    def _by_facing(self, stem: Organ, void: Void, state: State) -> FloatArray:
+        """Change (2,) of the logarithm of the stem's area, as far as it was seen, by where its points face."""
+        places, area = around_stem(stem.row(0).as_population)
         pose = self.pose_of(state)
-        seen = (area * (1.0 - self.hidden.void.at(places @ pose[:3, :3].T + pose[:3, 3]))).sum(axis=(0, 1))
+        seen = (area * (1.0 - void.at(places @ pose[:3, :3].T + pose[:3, 3]))).sum(axis=(0, 1))
         moves = POSE_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
         log = np.log([float(seen @ facing_share(state.facing + move)) for move in moves])
         change: FloatArray = (log[::2] - log[1::2]) / (2.0 * POSE_STEP)
@@ -366,8 +369,8 @@ class CloudLikelihood:
         done: Iterable[None] = map(block, firsts) if self._executor is None else self._executor.map(block, firsts)
         for _ in done:
             pass
-        if derivatives:
-            scores[:, FACING] -= np.outer(scores[:, -2] + state.share[0], self._by_facing(stem, state))
+        if derivatives and self.void is not None:
+            scores[:, FACING] -= np.outer(scores[:, -2] + state.share[0], self._by_facing(stem, self.void, state))
         prior = 0.5 * float(np.sum((state.theta - self.mean) ** 2 * self.precision))
         return Evaluation(prior - float(log_p.sum() if self.weights is None else self.weights @ log_p), scores, log_p)
 

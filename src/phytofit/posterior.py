@@ -17,6 +17,7 @@ from phytofit.covariance import of_sensor
 from phytofit.dependence import score_dependence
 from phytofit.distances import Reference, chamfer
 from phytofit.flags import OFFSET, along_stem
+from phytofit.hidden import Hidden
 from phytofit.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, State
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation
@@ -30,7 +31,6 @@ from phytofit.refining import (
     refined_end,
     refinement,
     terms,
-    void_of,
 )
 from phytofit.species import Species
 from phytofit.tip import gain_of_blunt_end
@@ -143,7 +143,7 @@ def _drawn_in(plain: Species, cloud: Cloud, begun: Sequence[tuple[FloatArray, Fl
 def _candidates(plain: Species, species: Species, cloud: Cloud, state: State) -> list[End]:
     """Refined: the paper's model, the same with its tip missing, and, if they promise enough, the two with all
     parameters of the species."""
-    found = [refined_end(plain, state, cloud, find_void=True)]
+    found = [refined_end(plain, state, cloud, with_void=True)]
     hidden = found[0].likelihood.hidden
     found.append(refined_end(plain, _cut(found[0].state), cloud, cut=True, hidden=hidden))
     if len(plain.space) == len(species.space):
@@ -152,11 +152,16 @@ def _candidates(plain: Species, species: Species, cloud: Cloud, state: State) ->
     if _promise(species, simple, cloud) <= SHAPE_PROMISE:
         return found
     rich = _rich(species, cloud, found[0])
-    hidden = rich[0].likelihood.hidden
-    if hidden is not None and void_of(hidden) is not void_of(found[0].likelihood.hidden):  # all are to have the same
-        hidden = hidden.without_holes()
+    if rich[0].likelihood.void is not found[0].likelihood.void:  # all are to have the same
+        hidden = _void_alone(rich[0])
         found = [refined_end(plain, it.state, cloud, cut=i == 1, hidden=hidden) for i, it in enumerate(found)]
     return [*found, *rich]
+
+
+def _void_alone(end: End) -> Hidden | None:
+    """What was not seen around the leaf's base, for a model that is to find its holes itself."""
+    hidden = end.likelihood.hidden
+    return None if hidden is None or hidden.void is None else hidden.without_holes()
 
 
 def _rich(species: Species, cloud: Cloud, simple: End) -> tuple[End, End]:
@@ -165,13 +170,12 @@ def _rich(species: Species, cloud: Cloud, simple: End) -> tuple[End, End]:
     cloud = cloud._replace(leaf_noise_cm=float(simple.state.noise[0]))
     part = cloud.part(FEW_POINTS)
     begun = [simple.state, *turned_blade(species, simple.likelihood, simple.state, simple.at.scores)]
-    known = simple.likelihood.hidden
-    void = None if known is None or known.void is None else known.without_holes()
+    known = _void_alone(simple)
     best = max(
-        (refined_end(species, it, part, thick=True, hidden=void) for it in begun), key=lambda end: end.fit_of_points
+        (refined_end(species, it, part, thick=True, hidden=known) for it in begun), key=lambda end: end.fit_of_points
     )
     best = _elsewhere(species, part, best, LOWER_ROUNDS)
-    best = refined_end(species, best.state, cloud, thick=True, hidden=best.likelihood.hidden, find_void=True)
+    best = refined_end(species, best.state, cloud, thick=True, hidden=best.likelihood.hidden, with_void=True)
     best = _elsewhere(species, cloud, best, 1)
     hidden = best.likelihood.hidden
     begun = [_cut(best.state, share) for share in CUT_SHARES]

@@ -11,7 +11,6 @@ from phytofit.holes import find_holes
 from phytofit.likelihood import CloudLikelihood, Evaluation, State
 from phytofit.optimize import Refined, refine
 from phytofit.species import Species
-from phytofit.voids import Void
 
 __all__ = [
     "COARSE_TOLERANCE",
@@ -22,7 +21,6 @@ __all__ = [
     "refined_end",
     "refinement",
     "terms",
-    "void_of",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -85,11 +83,11 @@ def refined_end(
     thick: bool = False,
     cut: bool = False,
     hidden: Hidden | None = None,
-    find_void: bool = False,
+    with_void: bool = False,
 ) -> End:
     """Where the state leads to; `hidden` is what is known before of what was not seen.
 
-    A void around the leaf's base stays as it is unless it is to `find_void`: of models that are compared all must have
+    The void around the leaf's base stays as it is; `with_void`, it is found anew. Models that are compared must have
     the same, for points are always denser beside a larger one.
     """
     for number in range(HOLE_ROUNDS):
@@ -101,15 +99,10 @@ def refined_end(
         end = refinement(likelihood, state)
         state = State(end.theta, state.pose, state.center)
         at = likelihood.evaluate(state)
-        hidden = find_holes(likelihood, state, at.scores, void_of(hidden), find=find_void)
+        hidden = find_holes(likelihood, state, at.scores, with_void=with_void)
         if _alike(hidden, likelihood.hidden):
             break
     return End(likelihood, state, at, end.converged)
-
-
-def void_of(hidden: Hidden | None) -> Void | None:
-    """The void of what was not seen, if there is one."""
-    return None if hidden is None else hidden.void
 
 
 def _alike(one: Hidden | None, other: Hidden | None) -> bool:

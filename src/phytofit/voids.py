@@ -49,18 +49,16 @@ class Void(NamedTuple):
 def find_void(
     points: FloatArray, on_stem: NDArray[np.bool_], stem: Organ, leaf: Organ, *, noise_cm: float
 ) -> Void | None:
-    """The ball near the leaf's base that holds next to none of the points (n, 3), but would most of them as the organs
-    have them, evenly along each; None where no such ball misses many of those on the stem (n,).
+    """The ball near the leaf's base that holds next to none of the points (n, 3), and would hold the most if both
+    organs were seen evenly along their axes; None where no such ball misses many of the stem's, `on_stem` (n,).
 
-    Around the stem they are expected where they are: the back of a stem that was seen from one side is no void.
+    Around the stem points are expected as they are found: the back of one that was seen from one side is no void.
     """
     base, near = leaf.axis[0], REACH_CM + sum(reach for reach, _ in GRIDS) * np.sqrt(3.0)
     those = points[np.linalg.norm(points - base, axis=1) < near]
     if len(those) <= STRAY or not on_stem.any():
         return None
-    places, area = around_stem(
-        Organ(stem.kind, stem.axis[np.newaxis], stem.frame[np.newaxis], stem.half_width[np.newaxis])
-    )
+    places, area = around_stem(stem.as_population)
     from_axis = (points[on_stem] - stem.axis[0]) @ stem.frame[0, :, 1:]
     angle = np.arctan2(from_axis[:, 1], from_axis[:, 0]) / (2.0 * np.pi) * N_AROUND
     sector = np.bincount(np.round(angle).astype(int) % N_AROUND, minlength=N_AROUND)

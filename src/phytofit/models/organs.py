@@ -43,6 +43,11 @@ class Organ:
         return Organ(self.kind, self.axis[i], self.frame[i], self.half_width[i])
 
     @property
+    def as_population(self) -> "Organ":
+        """One organ, as that of a population of one plant."""
+        return Organ(self.kind, self.axis[np.newaxis], self.frame[np.newaxis], self.half_width[np.newaxis])
+
+    @property
     def segment_lengths(self) -> FloatArray:
         """(..., m - 1), cm."""
         lengths: FloatArray = np.linalg.norm(np.diff(self.axis, axis=-2), axis=-1)
@@ -118,7 +123,7 @@ class SurfaceSampler:
 
     def draw(self, organs: Sequence[Organ]) -> tuple[FloatArray, NDArray[np.int8]]:
         """Points (n_points, 3), cm, on one plant, and the number (n_points,) of the organ that each lies on."""
-        batched = [Organ(o.kind, o.axis[np.newaxis], o.frame[np.newaxis], o.half_width[np.newaxis]) for o in organs]
+        batched = [organ.as_population for organ in organs]
         points, label = self.population(batched).draw(0)
         return points.T.astype(float), label
 
