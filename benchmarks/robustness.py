@@ -137,7 +137,7 @@ OUTLIERS, POINTS = (0.0, 0.1, 0.2, 0.3, 0.4), (300.0, 1000.0, 2500.0, 5000.0)
 VIEWS, OTHERS = (1.0, 2.0, 3.0, 4.0, 6.0, 8.0), (1.0, 2.0, 4.0)
 SWEEPS = {
     "noise": Sweep("cm", NOISE, NOISE[:5], with_noise, noise_cm=0.0),
-    HOLED: Sweep("share", HOLES, HOLES[:2], with_holes),
+    HOLED: Sweep("share", HOLES, HOLES[:4], with_holes),
     "tip cut off": Sweep("share of the midrib", TIPS, TIPS, without_tip),
     "outliers": Sweep("share of the points", OUTLIERS, OUTLIERS, with_outliers),
     "views": Sweep("cameras around the plant", VIEWS, VIEWS[2:], from_cameras),

@@ -8,10 +8,12 @@ from phytofit.covariance import covariance_of, misfit_of, mixed
 from phytofit.dependence import NONE, Bell, Dependence, score_dependence
 from phytofit.likelihood import CloudLikelihood
 from phytofit.optimize import refine
+from phytofit.refining import refinement
 
 SPECIES = phytofit.load_species()
 NAMES = SPECIES.space.names
 NOISE = np.array([0.3, 0.4, 0.3])
+SURER = 300.0  # times, a prior that says as much as so small a cloud
 
 
 def dependence(stem, leaf):
@@ -56,6 +58,34 @@ def at_rest(made, upper_taper):
     theta = refine(evaluate, state.theta, lower=likelihood.lower, upper=likelihood.upper).theta
     state = likelihood.with_theta(state, theta)
     return likelihood, state, likelihood.evaluate(state)
+
+
+def at_maximum(likelihood, start):
+    state = likelihood.with_theta(start, refinement(likelihood, start, max_iterations=200, tolerance=1e-9).theta)
+    return state, likelihood.evaluate(state)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_that_err_alike_and_a_prior_that_counts_as_often_say_what_the_points_say_once(seed):
+    """The oracle is the cloud itself: each of its points three times over tells nothing new."""
+    species = SPECIES.leading(7)
+    once = phytofit.simulate(fixed={"stem_length_above": 9.0}, n_points=300, noise_cm=0.5, seed=seed)
+    few = CloudLikelihood(species.model, species.space, once.points)
+    few.precision *= SURER
+    few.mean[:7] = once.x[:7]
+    state, at = at_maximum(few, few.start(once.x[:7], once.pose, 0.5))
+    one, _ = covariance_of(few, state, at, Dependence(at.scores.T @ at.scores, 1.0, 1e12, NONE, NONE))
+
+    many = CloudLikelihood(species.model, species.space, np.tile(once.points, (3, 1)))
+    many.precision, many.mean = few.precision, few.mean
+    light, _ = at_maximum(many, state)
+    assert np.abs(light.x - state.x).max() > 0.02  # there the prior counts for less
+    many = many.with_prior(np.ones(len(few.mean), bool), 3.0)
+    there, at = at_maximum(many, light)
+    np.testing.assert_allclose(there.theta, state.theta, atol=1e-3)
+    alike = Dependence(3.0 * at.scores.T @ at.scores, 3.0, 1e12, NONE, NONE)
+    three, _ = covariance_of(many, there, at, alike)
+    np.testing.assert_allclose(np.sqrt(np.diag(three)[:7] / np.diag(one)[:7]), 1.0, atol=0.25)
 
 
 @pytest.fixture(scope="module")

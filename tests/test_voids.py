@@ -142,3 +142,28 @@ def test_a_hidden_base_is_flagged_and_the_intervals_hold(seed):
             half = trait.value - trait.low  # the other may be open, by a tip that is in doubt
             assert abs(measured[trait.name].value - trait.value) < 1.5 * half  # three standard errors
             assert half < {"leaf_length": 1.2, "leaf_angle": 1.5, "stem_diameter": 0.2}[trait.name]
+
+
+@pytest.mark.parametrize("seed", [0, 2, 4])
+def test_where_a_leaf_of_its_own_shape_starts_is_not_read_off_errors_that_its_points_share(seed):
+    """Counted one by one, the points would put the start outside the stem (at its bound), and be sure of it."""
+    true = phytofit.simulate(
+        fixed={
+            "stem_length_above": 9.0,
+            "collar_offset": 0.9,
+            "leaf_base_bend": 30.0,
+            "leaf_bow": 25.0,
+            "leaf_side_bend": 25.0,
+            "leaf_base_width": 0.6,
+        },
+        noise_cm=0.3,
+        noise_reach_cm=1.5,
+        seed=seed,
+    )
+    result = phytofit.fit(without_ball(true, around_base(true, seed)), "cm", seed=seed)
+    assert any("base is hidden" in flag for flag in result.flags)
+    assert result.parameters["collar_offset"] < 1.0
+    found = next(t for t in result.traits if t.name == "leaf_length")
+    length = next(t.value for t in phytofit.measure(true.organs) if t.name == "leaf_length")
+    assert found.low < length < found.high
+    assert abs(found.value - length) < 2.0

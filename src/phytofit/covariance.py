@@ -39,7 +39,9 @@ def covariance_of(
     )  # a fit takes some errors up
     scores = at.scores[:, free]
     shared = dependence.variability[np.ix_(free, free)] - scores.T @ scores  # by neighbours
-    alone = covariance_of_independent(curvature, scores, likelihood.precision[free])
+    pull = likelihood.pull[free]
+    shared += np.diag(pull * (likelihood.prior_weight[free] - 1.0))  # what a prior counts for again is no more news
+    alone = covariance_of_independent(curvature, scores, pull)
     covariance = np.zeros((len(free), len(free)))
     covariance[np.ix_(free, free)] = (alone + inverse @ shared @ inverse) * dependence.n_independent / left
     covariance[np.ix_(free, free)] += _by_holes(likelihood, state, at, inverse)
@@ -110,7 +112,7 @@ def _curvature(likelihood: CloudLikelihood, state: State, at: Evaluation) -> Flo
     which nothing is known; the information where they are not positive definite."""
     free = np.flatnonzero(likelihood.free)
     gradient = likelihood.gradient(state, at)[free]
-    information = (at.scores.T @ at.scores + np.diag(likelihood.precision))[np.ix_(free, free)]
+    information = (at.scores.T @ at.scores + np.diag(likelihood.pull))[np.ix_(free, free)]
     curvature = np.zeros_like(information)
     for row, i in enumerate(free):
         if information[row, row] < LEAST_KNOWN:

@@ -57,7 +57,7 @@ class Sighting:
     by chance; ``end`` share of the midrib at which the leaf's last point lies, and ``short`` how many more would be
     expected beyond it; ``along_stem`` cm of the midrib that lie inside the stem, but so near its surface that they may
     as well be outside; ``leaf_points`` number of points on the leaf; ``base`` whether no void lies around its
-    start.
+    start, and it was not left to the prior where that is.
     """
 
     sections: FloatArray
@@ -75,6 +75,11 @@ class Sighting:
     def leaf(self) -> float:
         """Share of the leaf's area that was seen."""
         return float(np.mean(self.sections >= SEEN_DENSITY))
+
+    @property
+    def shows_base(self) -> bool:
+        """Whether something was seen where the leaf starts."""
+        return self.base and bool(np.any(self.sections[:BASE_SECTIONS] >= SEEN_DENSITY))
 
 
 def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Sighting:
@@ -107,7 +112,7 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
         short,
         risen,
         float(on_leaf.sum()),
-        void is None or bool(void.at(start) < HIDDEN_BASE),
+        bool(likelihood.prior_weight.max() == 1.0) and (void is None or bool(void.at(start) < HIDDEN_BASE)),
     )
 
 
@@ -252,7 +257,7 @@ def flags_of(
 
 
 def _of_what_was_seen(seen: Sighting, own_shape: bool) -> Iterator[str]:
-    if not seen.base or np.all(seen.sections[:BASE_SECTIONS] < SEEN_DENSITY):
+    if not seen.shows_base:
         yield "the leaf's base is hidden: its angle is read off the rest of the leaf"
     if seen.leaf < 0.5:
         yield f"only {100 * seen.leaf:.0f} % of the leaf was seen"

@@ -170,6 +170,7 @@ class CloudLikelihood:
         if leaf_noise_cm is not None:
             self.mean[LEAF_NOISE], self.std[LEAF_NOISE] = np.log(leaf_noise_cm), np.log(SAME_NOISE)
         self.precision = self.std**-2.0
+        self.prior_weight = np.ones(len(self.std))  # how often the prior counts: points that err alike count too often
         self.lower = np.array(
             [
                 *space.lower,
@@ -238,6 +239,17 @@ class CloudLikelihood:
         other.lower[FACING], other.upper[FACING] = -MOST_FACING, MOST_FACING
         return other
 
+    def with_prior(self, those: NDArray[np.bool_], weight: float) -> "CloudLikelihood":
+        """The same likelihood, in which the prior of `those` entries (k + 14,) of theta counts `weight` times."""
+        other = copy.copy(self)
+        other.prior_weight = np.where(those, weight, 1.0)
+        return other
+
+    @property
+    def pull(self) -> FloatArray:
+        """Second derivatives (k + 14,) of the error by theta that the prior brings."""
+        return self.precision * self.prior_weight
+
     def _seen_at(self, points: FloatArray) -> FloatArray:
         return np.ones(len(points)) if self.hidden is None or self.is_part else 1.0 - self.hidden.at(points)
 
@@ -257,7 +269,7 @@ class CloudLikelihood:
     def gradient(self, state: State, at: Evaluation) -> FloatArray:
         """Derivatives (k + 14,) of the error, where the state was evaluated."""
         of_points = at.scores.sum(axis=0) if self.weights is None else self.weights @ at.scores
-        gradient: FloatArray = (state.theta - self.mean) * self.precision - of_points
+        gradient: FloatArray = (state.theta - self.mean) * self.pull - of_points
         return gradient
 
     def pose_of(self, state: State) -> FloatArray:
@@ -371,7 +383,7 @@ class CloudLikelihood:
             pass
         if derivatives and self.void is not None:
             scores[:, FACING] -= np.outer(scores[:, -2] + state.share[0], self._by_facing(stem, self.void, state))
-        prior = 0.5 * float(np.sum((state.theta - self.mean) ** 2 * self.precision))
+        prior = 0.5 * float(np.sum((state.theta - self.mean) ** 2 * self.pull))
         return Evaluation(prior - float(log_p.sum() if self.weights is None else self.weights @ log_p), scores, log_p)
 
 

@@ -16,7 +16,7 @@ from phytofit.beginnings import along_points, longer_leaf, longer_stem, lower_in
 from phytofit.covariance import of_sensor
 from phytofit.dependence import score_dependence
 from phytofit.distances import Reference, chamfer
-from phytofit.flags import OFFSET, along_stem
+from phytofit.flags import OFFSET, along_stem, sighting
 from phytofit.hidden import Hidden
 from phytofit.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, State
 from phytofit.objectives import PaperObjective, minimise
@@ -51,6 +51,7 @@ SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: fourteen paramete
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning must fit better
 ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
+OF_START = (OFFSET, "leaf_base_bend")  # parameters that only the first twentieth of a leaf tells
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
 LOWER_ROUNDS = 3
@@ -108,7 +109,8 @@ def estimate(
     registration, _ = objective.register(search.mean)
     cloud = Cloud(points, organ, executor)
     state = _drawn_in(plain, cloud, [(search.mean, registration.T_target_source), *starts])
-    chosen = _at_surface(species, _one_sided(_choice(_candidates(plain, species, cloud, state))))
+    chosen = _one_sided(_choice(_candidates(plain, species, cloud, state)))
+    chosen = _at_surface(species, _with_hidden_base(chosen))
     return outcome(chosen, tuple(search.history), dithered=points is not given)
 
 
@@ -256,6 +258,23 @@ def _one_sided(chosen: Chosen) -> Chosen:
     if lead < 0.0:
         return chosen
     return chosen._replace(end=end, dependence=score_dependence(free, there))
+
+
+def _with_hidden_base(chosen: Chosen) -> Chosen:
+    """Where a leaf starts, if that was not seen, as the prior has it beside what the rest of the leaf says: its points
+    count as fewer there, for they err alike, by noise or as the model does not fit them."""
+    end, inflation = chosen.end, chosen.dependence.inflation
+    of_start = np.zeros(len(end.state.theta), bool)
+    of_start[: end.state.n_parameters] = np.isin(end.likelihood.space.names, OF_START)
+    if not of_start.any() or sighting(end.likelihood, end.state, end.at.scores).shows_base:
+        return chosen
+    careful = end.likelihood.with_prior(of_start, inflation)
+    refined = refinement(careful, end.state)
+    there = careful.with_theta(end.state, refined.theta)
+    return chosen._replace(
+        end=End(careful, there, careful.evaluate(there), refined.converged),
+        dependence=score_dependence(careful, there, chosen.dependence),
+    )
 
 
 def _at_surface(species: Species, chosen: Chosen) -> Chosen:

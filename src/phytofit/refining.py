@@ -127,7 +127,7 @@ def terms(likelihood: CloudLikelihood, state: State) -> tuple[float, FloatArray,
     """Error, gradient (k,), and Fisher information by the scores' outer product, with the prior's (k, k)."""
     at = likelihood.evaluate(state)
     weighted = at.scores if likelihood.weights is None else at.scores * likelihood.weights[:, np.newaxis]
-    return at.error, likelihood.gradient(state, at), at.scores.T @ weighted + np.diag(likelihood.precision)
+    return at.error, likelihood.gradient(state, at), at.scores.T @ weighted + np.diag(likelihood.pull)
 
 
 def evidence_of(end: End, inflation: float) -> float:
