@@ -85,7 +85,27 @@ def test_points_that_err_alike_and_a_prior_that_counts_as_often_say_what_the_poi
     np.testing.assert_allclose(there.theta, state.theta, atol=1e-3)
     alike = Dependence(3.0 * at.scores.T @ at.scores, 3.0, 1e12, NONE, NONE)
     three, _ = covariance_of(many, there, at, alike)
-    np.testing.assert_allclose(np.sqrt(np.diag(three)[:7] / np.diag(one)[:7]), 1.0, atol=0.25)
+    ratio = np.sqrt(np.diag(three)[:7] / np.diag(one)[:7])
+    np.testing.assert_allclose(ratio, 1.0, atol=0.25)
+    assert ratio[SPECIES.space.index("leaf_width")] == pytest.approx(1.0, abs=0.05)
+
+
+def test_what_a_prior_takes_to_a_bound_is_as_uncertain_as_the_prior(made):
+    """Of the leaf's start nothing was seen, and what else its points say counts little: that it is near the axis, where
+    the prior has its middle and about its end, is no news."""
+    i = NAMES.index("collar_offset")
+    kept = np.linalg.norm(made.points - made.organs[1].axis[0], axis=1) > 4.0
+    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, made.points[kept])
+    careful = likelihood.with_prior(np.arange(len(likelihood.mean)) == i, 500.0)
+    careful.lower[i] = 0.05
+    state, at = at_maximum(careful, likelihood.start(made.x, made.pose, 0.3))
+    assert state.theta[i] == 0.05
+    alike = Dependence(500.0 * at.scores.T @ at.scores, 500.0, 1e12, NONE, NONE)
+    covariance, _ = covariance_of(careful, state, at, alike)
+    assert np.sqrt(covariance[i, i]) == pytest.approx(SPECIES.space.std[i], rel=0.1)
+    assert (
+        covariance[i, NAMES.index("leaf_length")] < -0.5 * covariance[i, i]
+    )  # the leaf is longer if it starts further in
 
 
 @pytest.fixture(scope="module")

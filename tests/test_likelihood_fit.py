@@ -219,16 +219,25 @@ def test_a_narrow_leaf_in_much_noise_is_flagged():
     assert flagged(phytofit.fit(narrow.points, "cm", threads=2), "can't be told from the scatter")
 
 
-def test_a_parameter_at_its_bound_is_flagged(made):
+def bounded(name, **bounds):
     species = phytofit.load_species()
-    i = species.space.index("leaf_length")
-    short = [
-        dataclasses.replace(p, upper=50.0, mean=45.0) if j == i else p for j, p in enumerate(species.space.parameters)
-    ]
+    i = species.space.index(name)
+    narrow = [dataclasses.replace(p, **bounds) if j == i else p for j, p in enumerate(species.space.parameters)]
     ranges = species.ranges.copy()
-    ranges[i] = [40.0, 50.0]
-    bounded = dataclasses.replace(species, space=phytofit.ParameterSpace(short), ranges=ranges)
-    assert flagged(phytofit.fit(made.points, "cm", species=bounded, threads=2), "leaf_length lies at its bound")
+    ranges[i] = np.clip(ranges[i], narrow[i].lower, narrow[i].upper)
+    return dataclasses.replace(species, space=phytofit.ParameterSpace(narrow), ranges=ranges)
+
+
+def test_a_parameter_at_its_bound_is_flagged(made):
+    species = bounded("leaf_length", upper=50.0, mean=45.0)
+    assert flagged(phytofit.fit(made.points, "cm", species=species, threads=2), "leaf_length lies at its bound")
+
+
+def test_an_angle_of_a_leafs_own_shape_at_its_bound_is_flagged():
+    aside = phytofit.simulate(fixed=GENTLE | {"leaf_side_bend": 45.0}, n_points=N_POINTS, noise_cm=0.3, seed=7)
+    flag = "leaf_side_bend lies at its bound, 20 deg"
+    assert flagged(phytofit.fit(aside.points, "cm", species=bounded("leaf_side_bend", upper=20.0), threads=2), flag)
+    assert not flagged(phytofit.fit(aside.points, "cm", threads=2), "lies at its bound")
 
 
 def test_a_cloud_without_noise_is_fitted():

@@ -85,10 +85,12 @@ def shared_by_neighbors(dependence: Dependence, noise: FloatArray) -> float:
 
 
 def _held(likelihood: CloudLikelihood, state: State, at: Evaluation) -> NDArray[np.bool_]:
-    """Which entries of theta would be beyond their bounds, were there none; of the model's parameters but angles."""
+    """Which entries of theta would be beyond their bounds, were there none; of the model's parameters but angles, and
+    but those that a weighted prior takes there, not the points."""
     gradient = likelihood.gradient(state, at)
     held = np.where(gradient > 0.0, state.theta <= likelihood.lower, state.theta >= likelihood.upper)
     held[: state.n_parameters] &= np.array(likelihood.space.units) != "deg"
+    held &= likelihood.prior_weight == 1.0
     return held
 
 

@@ -56,8 +56,8 @@ class Sighting:
     other parts have; ``beyond`` number of points near the leaf's tip that are of no organ, 0 if there are not more than
     by chance; ``end`` share of the midrib at which the leaf's last point lies, and ``short`` how many more would be
     expected beyond it; ``along_stem`` cm of the midrib that lie inside the stem, but so near its surface that they may
-    as well be outside; ``leaf_points`` number of points on the leaf; ``base`` whether no void lies around its
-    start, and it was not left to the prior where that is.
+    as well be outside; ``leaf_points`` number of points on the leaf; ``base`` whether its start, as fitted, lies in
+    no void, and the prior of where that is did not count more often.
     """
 
     sections: FloatArray
@@ -273,13 +273,12 @@ def _of_what_was_seen(seen: Sighting, own_shape: bool) -> Iterator[str]:
 
 def _against_the_prior(space: ParameterSpace, x: FloatArray, scale: float) -> Iterator[str]:
     for i, p in enumerate(space.parameters):
-        if p.name not in BOUNDED:
-            continue
         value, unit = (x[i] * scale, _length_unit(scale)) if p.unit == "cm" else (x[i], p.unit)
         along_stem = p.name == "leaf_angle" and x[i] == p.lower and "leaf_base_bend" in space.names  # as leaves may be
-        if min(x[i] - p.lower, p.upper - x[i]) < NEAR_BOUND and not along_stem:
+        at_bound = min(x[i] - p.lower, p.upper - x[i]) < NEAR_BOUND and not along_stem
+        if at_bound and (p.name in BOUNDED or p.unit == "deg"):  # a share may be 0 or 1; no angle is the greatest
             yield f"{p.name} lies at its bound, {value:.3g} {unit}"
-        elif abs(x[i] - p.mean) > IMPLAUSIBLE * p.std:
+        elif p.name in BOUNDED and abs(x[i] - p.mean) > IMPLAUSIBLE * p.std:
             yield f"{p.name} is implausible for the species: {value:.3g} {unit}"
 
 

@@ -51,7 +51,7 @@ SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: fourteen paramete
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning must fit better
 ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
-OF_START = (OFFSET, "leaf_base_bend")  # parameters that only the first twentieth of a leaf tells
+OF_START = (OFFSET, "leaf_base_bend", "leaf_angle")  # beyond its first twentieth a leaf tells the angles' sum at best
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
 LOWER_ROUNDS = 3
@@ -261,13 +261,15 @@ def _one_sided(chosen: Chosen) -> Chosen:
 
 
 def _with_hidden_base(chosen: Chosen) -> Chosen:
-    """Where a leaf starts, if that was not seen, as the prior has it beside what the rest of the leaf says: its points
-    count as fewer there, for they err alike, by noise or as the model does not fit them."""
+    """Where a leaf starts, if something around it was not seen, as the prior has it beside what the rest of the leaf
+    says: its points count as fewer for that, since they err alike, by noise or as the model does not fit them."""
     end, inflation = chosen.end, chosen.dependence.inflation
+    if OFFSET not in end.likelihood.space.names or inflation == 1.0:
+        return chosen
+    if end.likelihood.void is None and sighting(end.likelihood, end.state, end.at.scores).shows_base:
+        return chosen
     of_start = np.zeros(len(end.state.theta), bool)
     of_start[: end.state.n_parameters] = np.isin(end.likelihood.space.names, OF_START)
-    if not of_start.any() or sighting(end.likelihood, end.state, end.at.scores).shows_base:
-        return chosen
     careful = end.likelihood.with_prior(of_start, inflation)
     refined = refinement(careful, end.state)
     there = careful.with_theta(end.state, refined.theta)
