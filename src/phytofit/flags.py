@@ -25,7 +25,7 @@ FEW_FOR_SHAPE = 200.0  # points, fewer than which tell little of a leaf with a s
 N_SECTORS = 12  # around the stem
 ROUND = 0.7  # share of them that must be seen
 BASE_SECTIONS = 2  # the leaf's first tenth
-HIDDEN_BASE = 0.5  # share of what is around a leaf's base that is not seen, from which that is hidden
+HIDDEN_BASE = 0.5  # share of what is around a leaf's base that may not have been seen, from which that is hidden
 END_SECTIONS = 3  # narrow: noise blurs them
 GAP, EMPTY, MANY_GAPS = 0.4, 0.1, 0.1  # of the typical number of points, twice; share of the blade
 FEW_ON_STEM = 60  # points
@@ -57,7 +57,7 @@ class Sighting:
     by chance; ``end`` share of the midrib at which the leaf's last point lies, and ``short`` how many more would be
     expected beyond it; ``along_stem`` cm of the midrib that lie inside the stem, but so near its surface that they may
     as well be outside; ``leaf_points`` number of points on the leaf; ``base`` whether its start, as fitted, lies in
-    no void, and the prior of where that is did not count more often.
+    no void, however large that may be, and the prior of where that is did not count more often.
     """
 
     sections: FloatArray
@@ -112,7 +112,7 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
         short,
         risen,
         float(on_leaf.sum()),
-        bool(likelihood.prior_weight.max() == 1.0) and (void is None or bool(void.at(start) < HIDDEN_BASE)),
+        bool(likelihood.prior_weight.max() == 1.0) and (void is None or bool(void.larger().at(start) < HIDDEN_BASE)),
     )
 
 

@@ -261,12 +261,12 @@ def _one_sided(chosen: Chosen) -> Chosen:
 
 
 def _with_hidden_base(chosen: Chosen) -> Chosen:
-    """Where a leaf starts, if something around it was not seen, as the prior has it beside what the rest of the leaf
-    says: its points count as fewer for that, since they err alike, by noise or as the model does not fit them."""
+    """Where a leaf starts, if that was not seen, as the prior has it beside what the rest of the leaf says: its points
+    count as fewer for that, since they err alike, by noise or as the model does not fit them."""
     end, inflation = chosen.end, chosen.dependence.inflation
     if OFFSET not in end.likelihood.space.names or inflation == 1.0:
         return chosen
-    if end.likelihood.void is None and sighting(end.likelihood, end.state, end.at.scores).shows_base:
+    if sighting(end.likelihood, end.state, end.at.scores).shows_base:
         return chosen
     of_start = np.zeros(len(end.state.theta), bool)
     of_start[: end.state.n_parameters] = np.isin(end.likelihood.space.names, OF_START)
