@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from phytofit.errors import NoPhytomerError
-from phytofit.pose import start_poses
+from phytofit.pose import StartPose, start_poses, with_tube
 from phytofit.simulation import simulate
 
 STEM_RADIUS = 2.7  # cm; the largest that a sorghum prior expects
@@ -50,6 +50,32 @@ def test_starts_near_the_truth_in_any_orientation(noise, above):
             assert angle(best.pose[:3, 0], cloud.pose[:3, 0]) < 2 * AXIS_DEG
     assert np.mean(near) >= NEAR_SHARE
     assert np.mean(first_is_up) >= NEAR_SHARE
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_tube_straightens_a_line_that_leaves_have_tilted(seed):
+    """Leaves on all sides, and a line that is 15 degrees off, 1 cm beside the stem and a quarter too thin."""
+    random = np.random.default_rng(seed)
+    made = simulate(
+        fixed={"stem_diameter": 4.6, "stem_length": 16.0, "stem_length_above": 8.0}, noise_cm=0.3, seed=seed
+    )
+    upright = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    other = upright[made.labels == 2][::2] * [-1.0, -1.0, 1.0] - [0.0, 0.0, 6.0]
+    tilt = np.deg2rad(15.0)
+    toward = random.uniform(0.0, 2.0 * np.pi)
+    by = Rotation.from_rotvec(tilt * np.array([np.cos(toward), np.sin(toward), 0.0])).as_matrix()
+    turn = Rotation.random(rng=random).as_matrix()
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn @ by, turn @ [0.7, 0.7, 16.0]
+    found = with_tube(np.concatenate([upright, other]) @ turn.T, StartPose(pose, -15.0, 7.0, 1.7, 0.0, 5.0))
+    assert angle(found.pose[:3, 2], turn[:, 2]) < 1.0
+    np.testing.assert_allclose(found.pose[:3, :3].T @ found.pose[:3, :3], np.eye(3), atol=1e-12)
+    assert np.linalg.det(found.pose[:3, :3]) == pytest.approx(1.0)
+    origin = turn.T @ found.pose[:3, 3]
+    assert np.hypot(*origin[:2]) < 0.3
+    assert found.radius == pytest.approx(2.3, abs=0.15)
+    assert origin[2] + found.foot == pytest.approx(0.0, abs=1.0)
+    assert origin[2] + found.top == pytest.approx(24.0, abs=1.0)
 
 
 def test_poses_are_rigid_and_best_first():

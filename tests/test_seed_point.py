@@ -1,5 +1,7 @@
 """Which leaf is meant, in a cloud that shows others too."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,6 +9,8 @@ from typer.testing import CliRunner
 
 import phytofit
 from phytofit.cli import app
+from phytofit.meant import meant_points
+from phytofit.pose import start_poses
 
 FIXED = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 15.0}
 LENGTH_CM = 1.5
@@ -70,6 +74,66 @@ def test_a_leaf_that_touches_the_one_that_is_meant_is_left_out(crowded):
     assert length_of(result) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
 
 
+def is_told_that_others_touch(result):
+    return any("other leaves touch this one, or its stem" in flag for flag in result.flags)
+
+
+def with_another(made, turn, lower):
+    """The phytomer's points, those of its leaf, turned about the stem and lowered, after them, and which are which."""
+    upright = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    other = upright[made.labels == 2] @ Rotation.from_euler("z", turn, degrees=True).as_matrix().T
+    points = np.concatenate([upright, other - [0.0, 0.0, lower]]) @ made.pose[:3, :3].T + made.pose[:3, 3]
+    return points, np.arange(len(points)) >= len(upright)
+
+
+@pytest.mark.parametrize("n_points", [500, 1000, 3000])
+@pytest.mark.parametrize(
+    ("turn", "lower", "touches"),
+    [(180.0, 4.0, True), (180.0, 12.0, False), (30.0, 0.0, True), (60.0, 0.0, True), (90.0, 1.0, True)],
+)
+def test_a_leaf_that_touches_or_is_beside_it_at_the_stem_is_flagged(turn, lower, touches, n_points):
+    made = phytofit.simulate(fixed=FIXED, n_points=n_points, noise_cm=0.3, seed=4)
+    points, _ = with_another(made, turn, lower)
+    told = meant_points(points, made.organs[1].axis[[15]], partial(start_poses, stem_radius=2.7))
+    assert told.others_touch == touches
+
+
+def test_what_touches_comes_with_the_result(crowded):
+    made, points, on_leaf = crowded
+    result = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
+    assert is_told_that_others_touch(result)
+
+
+def test_of_a_leaf_that_is_fused_with_the_one_that_is_meant_most_is_left_out(crowded):
+    made, _, on_leaf = crowded
+    points, foreign = with_another(made, 15.0, 2.0)
+    told = meant_points(points, on_leaf[np.newaxis], partial(start_poses, stem_radius=2.7))
+    upright = (points - made.pose[:3, 3]) @ made.pose[:3, :3]
+    beside = np.hypot(upright[:, 0], upright[:, 1]) > 4.0
+    assert np.mean(told.points[foreign & beside]) < 0.33
+    assert np.mean(told.points[~foreign]) > 0.95
+    assert told.others_touch
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_wide_stem_among_leaves_keeps_its_ends(seed):
+    random = np.random.default_rng(seed)
+    made = phytofit.simulate(
+        fixed={"stem_diameter": 5.0, "stem_length": 14.0, "stem_length_above": 12.0}, noise_cm=0.5, seed=seed
+    )
+    parts = [(made.points - made.pose[:3, 3]) @ made.pose[:3, :3]]
+    for turn in (100.0, 220.0):
+        leaf = parts[0][made.labels == 2] @ Rotation.from_euler("z", turn, degrees=True).as_matrix().T
+        parts.append(leaf + random.uniform(-10.0, 8.0) * np.eye(3)[2])
+    points = np.concatenate(parts)
+    told = meant_points(
+        points,
+        (made.organs[1].axis[[12]] - made.pose[:3, 3]) @ made.pose[:3, :3],
+        partial(start_poses, stem_radius=2.7),
+    )
+    assert np.mean(told.points[: len(made.points)][made.labels == 1]) > 0.97
+
+
 def test_a_turned_copy_keeps_the_same_points(crowded):
     made, points, on_leaf = crowded
     turn = Rotation.from_euler("xyz", [40.0, -70.0, 200.0], degrees=True).as_matrix()
@@ -117,6 +181,7 @@ def test_a_seed_point_of_a_whole_phytomer_changes_little(crowded):
     made, _, on_leaf = crowded
     with_seed = phytofit.fit(made.points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
     without = phytofit.fit(made.points, "cm", up=made.pose[:3, 2], threads=2)
+    assert not is_told_that_others_touch(with_seed)
     assert length_of(with_seed) == pytest.approx(length_of(without), abs=0.5)
 
 

@@ -127,7 +127,7 @@ def fit(
         pose=pose,
         error=result.error * found.scale if method == "paper" else result.error,
         reference=found.used.points[found.kept],
-        flags=(*((result.status.value,) if not result.status.good else ()), *result.flags),
+        flags=(*((result.status.value,) if not result.status.good else ()), *found.flags, *result.flags),
         notes=(*cloud.notes, *found.notes, *result.notes),
         relative=cloud.unit == "none",
         scale=found.scale,

@@ -1,6 +1,7 @@
 """Which points of a crowded cloud are of the phytomer that is meant: by seed points on its leaf."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,15 +10,14 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from phytofit.errors import NoPhytomerError, NoStemError, SettingError
-from phytofit.pose import StartPose
+from phytofit.pose import StartPose, near_stem, with_tube
 from phytofit.segmentation.graph import coarse, geodesics, plant_graph
 from phytofit.segmentation.growing import grow
 
-__all__ = ["meant_points"]
+__all__ = ["Meant", "meant_points"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
-STEM_MARGIN, STEM_MARGIN_CM = 1.3, 1.0  # of its radius, and more, around a stem within which points may be the stem's
 LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
 MANY = 100_000  # points; of more, one a voxel is enough
 LEAST_PIECE = 30  # points, or voxels; fewer are no piece of anything: those near to what is meant may be outliers
@@ -25,13 +25,22 @@ NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf, and a
 LIKELY = 0.25  # of the score of the most likely stem of all, from which that beside the seed is believed
 N_AROUND = 300  # points about a seed point, by which it is told how dense the leaf's are
 N_NODES = 8000  # to which the leaf and what touches it are thinned
-BESIDE_CM = 2.0  # so near to the leaf that is meant, a branch is a part of its blade
+BESIDE_CM = 2.0  # a branch with most of its points so near to the leaf that is meant is a part of its blade
+NEAR_BASE_CM = 8.0  # along the stem, from the base of the leaf that is meant; of others so near, some points are left
+FEW_TOUCH = 5  # points, fewer of which may be there by chance
 NOBODY = -1  # piece
+
+
+class Meant(NamedTuple):
+    """Which points (n,) are meant, and whether others are so near that some of theirs may be left."""
+
+    points: BoolArray
+    others_touch: bool
 
 
 def meant_points(
     points: FloatArray, seed_points: FloatArray, find_starts: Callable[[FloatArray], list[StartPose]]
-) -> BoolArray:
+) -> Meant:
     """Which points (n, 3), cm, are of the stem or of a leaf on which seed points (k, 3) lie.
 
     The stem is looked for, with `find_starts`, among the points that are connected with a seed point, or among all if
@@ -43,39 +52,47 @@ def meant_points(
     if len(points) <= MANY:
         return _meant(points, seed_points, find_starts)
     first, stands_for = coarse(points)
-    return _meant(points[first], seed_points, find_starts)[stands_for]
+    meant, others_touch = _meant(points[first], seed_points, find_starts)
+    return Meant(meant[stands_for], others_touch)
 
 
-def _meant(
-    points: FloatArray, seed_points: FloatArray, find_starts: Callable[[FloatArray], list[StartPose]]
-) -> BoolArray:
+def _meant(points: FloatArray, seed_points: FloatArray, find_starts: Callable[[FloatArray], list[StartPose]]) -> Meant:
     tree = cKDTree(points)
     _check_near(tree.query(seed_points)[0])
     link = _link(tree, tree.query(seed_points, k=min(N_AROUND, len(points)))[1].ravel())
     piece = _pieces(tree, link)
     seeded = np.isin(piece, piece[tree.query(seed_points)[1]])
-    start = _likely_start(points, seeded, find_starts)
+    start = with_tube(points, _likely_start(points, seeded, find_starts))
     upright = (points - start.pose[:3, 3]) @ start.pose[:3, :3]
     seeds = (seed_points - start.pose[:3, 3]) @ start.pose[:3, :3]
-    margin = STEM_MARGIN * start.radius + STEM_MARGIN_CM
-    near_stem = np.hypot(upright[:, 0], upright[:, 1]) < margin
-    near_stem &= (upright[:, 2] > start.foot - margin) & (upright[:, 2] < start.top + margin)
-    beside = np.flatnonzero(~near_stem)
+    at_stem = near_stem(upright, start)
+    beside = np.flatnonzero(~at_stem)
     tree = cKDTree(upright[beside])
     gap, nearest = tree.query(seeds)
     _check_near(gap)
     piece = np.full(len(points), NOBODY)
     piece[beside] = _pieces(tree, link)
     own = np.unique(piece[beside[nearest]])
-    connected = np.flatnonzero(near_stem | np.isin(piece, own))
+    connected = np.flatnonzero(at_stem | np.isin(piece, own))
     other = _of_other_branches(upright[connected], seeds, start.foot)
     leaf = piece.copy()
     leaf[connected[other > 0]] = piece.max() + other[other > 0]
-    leaf[near_stem] = NOBODY
+    leaf[at_stem] = NOBODY
     of_others = (np.bincount(leaf + 1)[leaf + 1] >= LEAST_PIECE) & (leaf != NOBODY) & ~np.isin(leaf, own)
-    far = cKDTree(upright[near_stem | np.isin(leaf, own)]).query(upright)[0] > NEAREST_CM
-    meant: BoolArray = ~(of_others | far)
-    return meant
+    of_meant = np.isin(leaf, own)
+    far = cKDTree(upright[at_stem | of_meant]).query(upright)[0] > NEAREST_CM
+    return Meant(~(of_others | far), _touches(upright, at_stem, of_meant, of_others))
+
+
+def _touches(upright: FloatArray, at_stem: BoolArray, of_meant: BoolArray, of_others: BoolArray) -> bool:
+    """Whether points (n, 3) of others come near to the leaf that is meant, or to the stem near to where it leaves that:
+    anywhere, where its own points near the stem are hidden."""
+    leaf, others = upright[of_meant], upright[of_others]
+    near_leaf = cKDTree(leaf).query(others)[0] < BESIDE_CM
+    stem = cKDTree(upright[at_stem])
+    base, beside = (points[stem.query(points)[0] < NEAREST_CM, 2] for points in (leaf, others))
+    near_base = np.abs(beside - np.median(base)) < NEAR_BASE_CM if len(base) else np.ones(len(beside), bool)
+    return bool(max(np.count_nonzero(near_leaf), np.count_nonzero(near_base)) >= FEW_TOUCH)
 
 
 def _likely_start(
@@ -148,5 +165,7 @@ def _of_other_branches(upright: FloatArray, seeds: FloatArray, foot: float) -> N
         meant += [child for child in regions[i].children if child not in outermost and regions[child].level >= reached]
     of_point = branch[tree.query(upright)[1]]
     other = ~np.isin(of_point, meant)
-    other[other] = cKDTree(upright[~other]).query(upright[other])[0] > BESIDE_CM  # a strip of the same blade is not
-    return np.where(other, of_point + 1, 0)
+    beside = cKDTree(upright[~other]).query(upright[other])[0] < BESIDE_CM
+    whole, near = (np.bincount(of_point[other][which], minlength=len(regions)) for which in (slice(None), beside))
+    strips = np.flatnonzero(2 * near > whole)  # of the same blade
+    return np.where(other & ~np.isin(of_point, strips), of_point + 1, 0)

@@ -16,6 +16,7 @@ __all__ = ["Prepared", "prepare"]
 FloatArray = NDArray[np.float64]
 N_LOOKED_AT = 100_000  # points, if they are all kept for the fit, in which the stem is looked for
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
+OTHERS_TOUCH = "other leaves touch this one, or its stem beside it: angle, width and diameter may be off"
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class Prepared:
     are left when it is thinned, ``points`` (m, 3) those as seen from the best start pose, upright, in the prior's cm,
     ``organ`` (m,) what their labels say (0 stem, 1 leaf, -1 unknown) or None; ``starts`` the start poses in that
     frame; ``home`` (4, 4) maps it to the cloud's, ``scale`` of whose lengths make a cm.  ``notes`` tell what was left
-    out.
+    out, ``flags`` what that may have done to the rest.
     """
 
     used: PointCloud
@@ -37,6 +38,7 @@ class Prepared:
     home: FloatArray
     scale: float
     notes: tuple[str, ...] = ()
+    flags: tuple[str, ...] = ()
 
 
 def prepare(
@@ -62,10 +64,12 @@ def prepare(
     scale = size_cm(clean.points) / _expected_size(species) if cloud.unit == "none" else 1.0
     find_starts = partial(start_poses, stem_radius=_largest_stem_radius(species), up=up)
     if seed_points is not None:
-        meant = cloud.take(np.flatnonzero(meant_points(cloud.points / scale, seed_points / scale, find_starts)))
+        told, others_touch = meant_points(cloud.points / scale, seed_points / scale, find_starts)
+        meant = cloud.take(np.flatnonzero(told))
         found = prepare(meant, species, n_points=n_points, up=up, with_outliers=with_outliers)
         left_out = f"{len(cloud) - len(meant)} of {len(cloud)} points left out: not of a seed point's leaf"
-        return replace(found, notes=(left_out, *found.notes))
+        flags = (OTHERS_TOUCH, *found.flags) if others_touch else found.flags
+        return replace(found, notes=(left_out, *found.notes), flags=flags)
     starts = find_starts(clean.points / scale)
     home = starts[0].pose
     upright = np.round((used.points / scale - home[:3, 3]) @ home[:3, :3], CANONICAL_DECIMALS)
