@@ -53,6 +53,7 @@ def plot_fit(result: Fit, title: str = "") -> Figure:
     numbers = ", ".join(f"{name.replace('_', ' ')} {found[name].value:.1f} {found[name].unit}" for name in SHOWN)
     lines = [title, numbers.replace(" deg", "°"), *(f"flag: {flag}" for flag in result.flags)]
     figure.suptitle("\n".join(line for line in lines if line), fontsize=11)
+    figure.draw_without_rendering()  # the layout is right from the second time on
     return figure
 
 
