@@ -8,7 +8,8 @@ author = "The phytofit developers"
 project_copyright = author
 version = release = installed_version("phytofit")
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax", "sphinx-mathjax-offline"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+extensions += ["sphinx-mathjax-offline"]  # equations show without a network
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = f"phytofit {release}"
