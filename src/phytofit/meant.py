@@ -78,15 +78,15 @@ def _meant(points: FloatArray, seed_points: FloatArray, find_starts: Callable[[F
     leaf = piece.copy()
     leaf[connected[other > 0]] = piece.max() + other[other > 0]
     leaf[at_stem] = NOBODY
-    of_others = (np.bincount(leaf + 1)[leaf + 1] >= LEAST_PIECE) & (leaf != NOBODY) & ~np.isin(leaf, own)
     of_meant = np.isin(leaf, own)
+    of_others = (np.bincount(leaf + 1)[leaf + 1] >= LEAST_PIECE) & (leaf != NOBODY) & ~of_meant
     far = cKDTree(upright[at_stem | of_meant]).query(upright)[0] > NEAREST_CM
     return Meant(~(of_others | far), _touches(upright, at_stem, of_meant, of_others))
 
 
 def _touches(upright: FloatArray, at_stem: BoolArray, of_meant: BoolArray, of_others: BoolArray) -> bool:
-    """Whether points (n, 3) of others come near to the leaf that is meant, or to the stem near to where it leaves that:
-    anywhere, where its own points near the stem are hidden."""
+    """Whether points (n, 3) of others come near to the leaf that is meant, or to the stem about as high as that leaf
+    does; at any height, where none of its points near the stem was seen."""
     leaf, others = upright[of_meant], upright[of_others]
     near_leaf = cKDTree(leaf).query(others)[0] < BESIDE_CM
     stem = cKDTree(upright[at_stem])
@@ -165,7 +165,7 @@ def _of_other_branches(upright: FloatArray, seeds: FloatArray, foot: float) -> N
         meant += [child for child in regions[i].children if child not in outermost and regions[child].level >= reached]
     of_point = branch[tree.query(upright)[1]]
     other = ~np.isin(of_point, meant)
+    whole = np.bincount(of_point[other], minlength=len(regions))
     beside = cKDTree(upright[~other]).query(upright[other])[0] < BESIDE_CM
-    whole, near = (np.bincount(of_point[other][which], minlength=len(regions)) for which in (slice(None), beside))
-    strips = np.flatnonzero(2 * near > whole)  # of the same blade
-    return np.where(other & ~np.isin(of_point, strips), of_point + 1, 0)
+    strip = 2 * np.bincount(of_point[other][beside], minlength=len(regions)) > whole  # of the same blade
+    return np.where(other & ~strip[of_point], of_point + 1, 0)

@@ -87,31 +87,32 @@ def near_stem(upright: FloatArray, start: StartPose) -> NDArray[np.bool_]:
 def with_tube(points: FloatArray, start: StartPose) -> StartPose:
     """The start pose, its score and curl apart, on the tube that lies nearest to the points (n, 3) around its stem.
 
-    Leaves beside a wide stem tilt the line that `start_poses` finds along it, by up to 20 degrees.  Robust least
+    Leaves beside a wide stem tilt the line that `start_poses` finds along it, by ten degrees and more.  Robust least
     squares (Cauchy's loss) of the points' distances from a tube, which the leaves' move little.  In a stem that is
     filled with points, it is two thirds as wide.
     """
-    upright = (points - start.pose[:3, 3]) @ start.pose[:3, :3]
-    foot, top, radius = start.foot, start.top, start.radius
-    middle = np.array([0.0, 0.0, 0.5 * (foot + top)])
+    radius, middle = start.radius, 0.5 * (start.foot + start.top)
+    upright = (points - start.pose[:3, 3]) @ start.pose[:3, :3] - [0.0, 0.0, middle]
+    foot, top = start.foot - middle, start.top - middle
     limit = np.array([2.0 * radius, 2.0 * radius, TUBE_SLOPE, TUBE_SLOPE])
     bounds = np.stack([np.append(-limit, radius / TUBE_WIDER), np.append(limit, radius * TUBE_WIDER)])
     tube = np.array([0.0, 0.0, 0.0, 0.0, radius])
     for _ in range(N_TUBES):
-        near = upright[_near_tube(upright - middle, tube, foot - middle[2], top - middle[2])] - middle
+        near = upright[_near_tube(upright, tube, foot, top)]
         if len(near) < len(tube):
             return start
         tube = least_squares(
             lambda tube, near=near: _off_tube(near, tube), tube, bounds=bounds, loss="cauchy", f_scale=TUBE_NOISE_CM
         ).x
-        foot, top = np.quantile(near[_off_tube(near, tube) < TUBE_NOISE_CM, 2], [0.01, 0.99]) + middle[2]
+        foot, top = np.quantile(near[_off_tube(near, tube) < TUBE_NOISE_CM, 2], [0.01, 0.99])
     axis = np.array([*tube[2:4], 1.0]) / np.sqrt(1.0 + tube[2] ** 2 + tube[3] ** 2)
     side = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
     side /= np.linalg.norm(side)
     pose = start.pose.copy()
-    pose[:3, 3] += pose[:3, :3] @ [*(tube[:2] - tube[2:4] * middle[2]), 0.0]
+    pose[:3, 3] += pose[:3, :3] @ [*(tube[:2] - tube[2:4] * middle), 0.0]
     pose[:3, :3] = pose[:3, :3] @ np.stack([side, np.cross(axis, side), axis], axis=1)
-    return replace(start, pose=pose, foot=float(foot / axis[2]), top=float(top / axis[2]), radius=float(tube[4]))
+    foot, top = float((foot + middle) / axis[2]), float((top + middle) / axis[2])
+    return replace(start, pose=pose, foot=foot, top=top, radius=float(tube[4]))
 
 
 def _off_tube(points: FloatArray, tube: FloatArray) -> FloatArray:
