@@ -13,7 +13,7 @@ from phytofit.errors import InputError
 from phytofit.validation import agreement, compare, concordance, read_measures, read_results
 
 LEAVES = ((1, 20.0), (2, 30.0), (3, 40.0))  # ranks, and lengths in cm
-RESULT = "cloud,organ,rank,trait,value,unit,low,high,method,flags\n"
+RESULT = "cloud,plant,organ,rank,trait,value,unit,low,high,method,flags\n"
 ROUNDING = 1e-9
 
 
@@ -85,7 +85,7 @@ def test_what_is_no_table_of_measures_is_said(tmp_path, text, said):
 
 
 def test_the_truth_of_simulated_phytomers_is_read(tmp_path):
-    path = written(tmp_path, RESULT + "phytomer_0001,leaf,1,leaf_length,55.5,cm,,,truth,\n")
+    path = written(tmp_path, RESULT + "phytomer_0001,1,leaf,1,leaf_length,55.5,cm,,,truth,\n")
     assert read_measures(path)["value"].tolist() == [55.5]
     assert read_results(path)["value"].tolist() == [55.5]
     assert read_results(path)["low"].isna().all()
@@ -151,7 +151,7 @@ def test_one_that_is_far_off_is_named_and_none_of_a_few():
 
 def test_the_command_writes_one_page_and_two_tables(tmp_path):
     rows = "".join(
-        f"c{i},leaf,1,leaf_length,{50 + i},cm,{48 + i},{'' if i == 2 else 52 + i},m,{'tip' if i == 2 else ''}\n"
+        f"c{i},1,leaf,1,leaf_length,{50 + i},cm,{48 + i},{'' if i == 2 else 52 + i},m,{'tip' if i == 2 else ''}\n"
         for i in range(4)
     )
     (tmp_path / "results").mkdir()
@@ -184,7 +184,7 @@ def test_the_command_writes_one_page_and_two_tables(tmp_path):
 )
 def test_the_command_says_what_is_wrong(tmp_path, results, said):
     hand = written(tmp_path, "cloud,trait,value,unit\na,leaf_length,3,cm\n")
-    written(tmp_path, RESULT + "b,leaf,1,leaf_length,3,cm,,,m,\n", "other.csv")
+    written(tmp_path, RESULT + "b,1,leaf,1,leaf_length,3,cm,,,m,\n", "other.csv")
     done = CliRunner().invoke(
         app, ["validate", str(tmp_path / results), "--truth", str(hand), "--out", str(tmp_path / "v")]
     )

@@ -19,13 +19,17 @@ from phytofit.traits import Trait
 
 __all__ = ["COLUMNS", "save_fit", "trait_table"]
 
-COLUMNS = ["cloud", "organ", "rank", "trait", "value", "unit", "low", "high", "method", "flags"]
+COLUMNS = ["cloud", "plant", "organ", "rank", "trait", "value", "unit", "low", "high", "method", "flags"]
 
 
-def trait_table(name: str, traits: Iterable[Trait]) -> pd.DataFrame:
-    """Tidy table of traits, one row an organ and trait, with the columns `COLUMNS`; `name` is the cloud's."""
+def trait_table(name: str, traits: Iterable[Trait], *, plant: int = 1) -> pd.DataFrame:
+    """Tidy table of traits with the columns `COLUMNS`, one row for each organ and trait.
+
+    `name` is the cloud's; `plant` the number of the plant in it, from 1, where a cloud holds several.
+    """
     rows = [
-        (name, t.organ, t.rank, t.name, t.value, t.unit, t.low, t.high, t.method, "; ".join(t.flags)) for t in traits
+        (name, plant, t.organ, t.rank, t.name, t.value, t.unit, t.low, t.high, t.method, "; ".join(t.flags))
+        for t in traits
     ]
     return pd.DataFrame(rows, columns=COLUMNS).astype({"low": float, "high": float})
 
@@ -51,7 +55,7 @@ def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
     """What fit.json holds; no times, so that the same run gives the same bytes."""
     space = result.species.space
     intervals = result.parameter_intervals
-    traits = trait_table(name, result.traits).drop(columns=["cloud", "flags"]).replace({np.nan: None})
+    traits = trait_table(name, result.traits).drop(columns=["cloud", "plant", "flags"]).replace({np.nan: None})
     return {
         "phytofit": version("phytofit"),
         "cloud": name,

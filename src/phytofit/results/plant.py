@@ -127,12 +127,13 @@ def save_segmentation(result: Segmentation, folder: str | Path, name: str | None
     return Path(folder) / name
 
 
-def leaf_table(name: str, result: Segmentation) -> pd.DataFrame:
-    """Tidy table of a plant's leaves, one row a leaf; lengths in cm, or relative where the cloud has no unit."""
+def leaf_table(name: str, result: Segmentation, *, plant: int = 1) -> pd.DataFrame:
+    """Tidy table of a plant's leaves, one row for each; lengths in cm, or relative where the cloud has no unit."""
     unit = "rel" if result.cloud.unit == "none" else "cm"
     rows = [
         {
             "cloud": name,
+            "plant": plant,
             "rank": leaf.rank,
             "label": leaf.rank + 1,
             "azimuth_deg": leaf.azimuth,
