@@ -36,7 +36,6 @@ LAYERS = [
     {"intervals", "optimize", "traits", "voids"},
     {"species"},
     {"models"},
-    {"formats"},
     {"cloud"},
     {"kernels"},
     {"parameters", "parsing"},

@@ -384,7 +384,7 @@ def test_size_of_a_ring_and_of_nothing() -> None:
     "pattern", ["sodhi2018/greenhouse/*.ply", "sodhi2018/field/*.ply", "*/*.txt", "trackplant3d/*/*.txt"]
 )
 def test_real_clouds_keep_almost_all_and_thin_to_the_count(pattern: str) -> None:
-    from phytofit.formats import read_cloud  # noqa: PLC0415
+    from phytofit.cloud import read_cloud  # noqa: PLC0415
 
     for path in sorted(DATA.glob(pattern))[::3]:
         points = read_cloud(path, "none").points

@@ -5,7 +5,7 @@
 >>> result.parameters["leaf_length"], [trait.value for trait in result.traits]
 """
 
-from phytofit.cloud import PointCloud, from_points, remove_outliers, thin
+from phytofit.cloud import PointCloud, from_points, read_cloud, remove_outliers, thin, write_cloud
 from phytofit.distances import DISTANCES, Reference
 from phytofit.errors import (
     CloudError,
@@ -21,7 +21,6 @@ from phytofit.errors import (
 )
 from phytofit.fitted import Fit
 from phytofit.fitting import fit, mean_at
-from phytofit.formats import read_cloud, write_cloud
 from phytofit.likelihood import CloudLikelihood
 from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move
 from phytofit.objectives import PaperObjective, Registration, minimise

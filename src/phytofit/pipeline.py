@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from phytofit.cloud import PointCloud
+from phytofit.cloud import PointCloud, read_cloud
 from phytofit.errors import CloudError, InputError, NoPhytomerError
 from phytofit.fitting import fit
-from phytofit.formats import read_cloud
 from phytofit.plots import plot_plant
 from phytofit.reconstruct import depth_files, reconstruct
 from phytofit.results import (

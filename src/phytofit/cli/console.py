@@ -7,9 +7,8 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from phytofit.cloud import PointCloud
+from phytofit.cloud import PointCloud, read_cloud
 from phytofit.errors import PhytofitError
-from phytofit.formats import read_cloud
 from phytofit.parsing import AXES
 from phytofit.species import species_names
 

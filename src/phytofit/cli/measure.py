@@ -29,12 +29,11 @@ from phytofit.cli.console import (
     out,
     read_quietly,
 )
-from phytofit.cloud import PointCloud
+from phytofit.cloud import PointCloud, read_cloud, write_cloud
 from phytofit.distances import DISTANCES
 from phytofit.errors import PhytofitError, SettingError
 from phytofit.fitted import Fit
 from phytofit.fitting import METHODS, fit
-from phytofit.formats import read_cloud, write_cloud
 from phytofit.optimize import Generation
 from phytofit.parsing import parse_up
 from phytofit.recipe import defaults, recipe

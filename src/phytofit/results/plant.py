@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from phytofit.cloud import read_cloud, write_cloud
 from phytofit.errors import InputError, OutputError
-from phytofit.formats import read_cloud, write_cloud
 from phytofit.plots import plot_reconstruction, plot_segmentation
 from phytofit.reconstruct import Reconstruction
 from phytofit.results.files import input_of, table_text, whole_folder

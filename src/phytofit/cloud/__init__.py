@@ -1,0 +1,20 @@
+"""Point clouds: arrays in centimetres, read from files, written, thinned."""
+
+from phytofit.cloud.cloud import MIN_POINTS, PointCloud, from_points
+from phytofit.cloud.read import READERS, read_cloud
+from phytofit.cloud.thinning import remove_outliers, size_cm, thin
+from phytofit.cloud.units import SCALE_CM
+from phytofit.cloud.write import write_cloud
+
+__all__ = [
+    "MIN_POINTS",
+    "READERS",
+    "SCALE_CM",
+    "PointCloud",
+    "from_points",
+    "read_cloud",
+    "remove_outliers",
+    "size_cm",
+    "thin",
+    "write_cloud",
+]
