@@ -39,7 +39,7 @@ LAYERS = [
     {"cloud"},
     {"kernels"},
     {"parameters", "parsing"},
-    {"errors", "text"},
+    {"bundled", "errors", "text"},
 ]
 DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}
 

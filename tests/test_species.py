@@ -6,9 +6,10 @@ from importlib import resources
 import numpy as np
 import pytest
 
+from phytofit.bundled import species_names
 from phytofit.errors import InputError, SpeciesError
 from phytofit.models import Phytomer
-from phytofit.species import load_species, species_names
+from phytofit.species import load_species
 
 SORGHUM = (resources.files("phytofit") / "species" / "sorghum.toml").read_text(encoding="utf-8")
 

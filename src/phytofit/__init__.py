@@ -5,39 +5,45 @@
 >>> result.parameters["leaf_length"], [trait.value for trait in result.traits]
 """
 
-from phytofit.cloud import PointCloud, from_points, read_cloud, remove_outliers, thin, write_cloud
-from phytofit.distances import DISTANCES, Reference
-from phytofit.errors import (
-    CloudError,
-    InputError,
-    NoPhytomerError,
-    NoStemError,
-    OutputError,
-    PhytofitError,
-    SettingError,
-    SpeciesError,
-    Status,
-    UnitError,
-)
-from phytofit.fitted import Fit
-from phytofit.fitting import fit, mean_at
-from phytofit.likelihood import CloudLikelihood
-from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move
-from phytofit.objectives import PaperObjective, Registration, minimise
-from phytofit.optimize import CrossEntropy, Generation
-from phytofit.outcome import Estimate
-from phytofit.parameters import Parameter, ParameterSpace
-from phytofit.plots import plot_convergence, plot_fit, plot_reconstruction, plot_segmentation
-from phytofit.pose import StartPose, start_poses
-from phytofit.preparation import Prepared, prepare
-from phytofit.recipe import recipe
-from phytofit.reconstruct import CAMERAS, Camera, Reconstruction, load_camera, reconstruct
-from phytofit.results import leaf_table, save_fit, save_reconstruction, save_segmentation, trait_table
-from phytofit.segmentation import Segmentation, SegmentedLeaf, segment
-from phytofit.simulation import SimulatedPhytomer, add_noise, add_outliers, occlude, simulate
-from phytofit.species import Species, load_species
-from phytofit.traits import Trait, measure
-from phytofit.validation import Agreement, Comparison, agreement, compare, read_measures, read_results
+import importlib
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from phytofit.cloud import PointCloud, from_points, read_cloud, remove_outliers, thin, write_cloud
+    from phytofit.distances import DISTANCES, Reference
+    from phytofit.errors import (
+        CloudError,
+        InputError,
+        NoPhytomerError,
+        NoStemError,
+        OutputError,
+        PhytofitError,
+        SettingError,
+        SpeciesError,
+        Status,
+        UnitError,
+    )
+    from phytofit.fitted import Fit
+    from phytofit.fitting import fit, mean_at
+    from phytofit.likelihood import CloudLikelihood
+    from phytofit.models import Organ, Phytomer, SurfaceSampler, mesh, move
+    from phytofit.objectives import PaperObjective, Registration, minimise
+    from phytofit.optimize import CrossEntropy, Generation
+    from phytofit.outcome import Estimate
+    from phytofit.parameters import Parameter, ParameterSpace
+    from phytofit.plots import plot_convergence, plot_fit, plot_reconstruction, plot_segmentation
+    from phytofit.pose import StartPose, start_poses
+    from phytofit.preparation import Prepared, prepare
+    from phytofit.recipe import recipe
+    from phytofit.reconstruct import CAMERAS, Camera, Reconstruction, load_camera, reconstruct
+    from phytofit.results import leaf_table, save_fit, save_reconstruction, save_segmentation, trait_table
+    from phytofit.segmentation import Segmentation, SegmentedLeaf, segment
+    from phytofit.simulation import SimulatedPhytomer, add_noise, add_outliers, occlude, simulate
+    from phytofit.species import Species, load_species
+    from phytofit.traits import Trait, measure
+    from phytofit.validation import Agreement, Comparison, agreement, compare, read_measures, read_results
 
 __all__ = [
     "CAMERAS",
@@ -113,3 +119,65 @@ __all__ = [
     "trait_table",
     "write_cloud",
 ]
+
+MODULES = {  # that are imported when the first of their names is asked for, so that ``import phytofit`` takes no time
+    "phytofit.cloud": ("PointCloud", "from_points", "read_cloud", "remove_outliers", "thin", "write_cloud"),
+    "phytofit.distances": ("DISTANCES", "Reference"),
+    "phytofit.errors": (
+        "CloudError",
+        "InputError",
+        "NoPhytomerError",
+        "NoStemError",
+        "OutputError",
+        "PhytofitError",
+        "SettingError",
+        "SpeciesError",
+        "Status",
+        "UnitError",
+    ),
+    "phytofit.fitted": ("Fit",),
+    "phytofit.fitting": ("fit", "mean_at"),
+    "phytofit.likelihood": ("CloudLikelihood",),
+    "phytofit.models": ("Organ", "Phytomer", "SurfaceSampler", "mesh", "move"),
+    "phytofit.objectives": ("PaperObjective", "Registration", "minimise"),
+    "phytofit.optimize": ("CrossEntropy", "Generation"),
+    "phytofit.outcome": ("Estimate",),
+    "phytofit.parameters": ("Parameter", "ParameterSpace"),
+    "phytofit.plots": ("plot_convergence", "plot_fit", "plot_reconstruction", "plot_segmentation"),
+    "phytofit.pose": ("StartPose", "start_poses"),
+    "phytofit.preparation": ("Prepared", "prepare"),
+    "phytofit.recipe": ("recipe",),
+    "phytofit.reconstruct": ("CAMERAS", "Camera", "Reconstruction", "load_camera", "reconstruct"),
+    "phytofit.results": ("leaf_table", "save_fit", "save_reconstruction", "save_segmentation", "trait_table"),
+    "phytofit.segmentation": ("Segmentation", "SegmentedLeaf", "segment"),
+    "phytofit.simulation": ("SimulatedPhytomer", "add_noise", "add_outliers", "occlude", "simulate"),
+    "phytofit.species": ("Species", "load_species"),
+    "phytofit.traits": ("Trait", "measure"),
+    "phytofit.validation": ("Agreement", "Comparison", "agreement", "compare", "read_measures", "read_results"),
+}
+HOMES = {name: module for module, names in MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return importlib.import_module("importlib.metadata").version("phytofit")
+    if name not in HOMES:
+        raise AttributeError(f"module 'phytofit' has no attribute {name!r}")
+    value = getattr(importlib.import_module(HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+class _Package(ModuleType):
+    """Importing ``phytofit.recipe``, the module, does not hide ``phytofit.recipe``, the function."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in HOMES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

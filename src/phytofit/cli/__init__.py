@@ -2,12 +2,12 @@
 
 import sys
 
-from phytofit.cli import measure, plant, validate
+from phytofit.cli import demo, fit, recipe, reconstruct, run, segment, simulate, validate
 from phytofit.cli.console import app, err
 
 __all__ = ["app", "main"]
 
-COMMANDS = (measure, plant, validate)  # modules that add theirs to the program when they are imported
+COMMANDS = (demo, fit, run, segment, reconstruct, simulate, validate, recipe)  # each adds its own when it is imported
 
 
 def main() -> None:

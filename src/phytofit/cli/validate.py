@@ -2,15 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import pandas as pd
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from phytofit.cli.console import (
+from phytofit.cli.console import app, complain, err, or_exit, out
+from phytofit.cli.options import (
     NoiseOption,
     NoiseReachOption,
     OutliersOption,
@@ -21,26 +21,21 @@ from phytofit.cli.console import (
     SpheresOption,
     ThreadsOption,
     ViewsOption,
-    app,
-    complain,
-    err,
-    or_exit,
-    out,
 )
-from phytofit.fitting import fit
-from phytofit.recipe import defaults
-from phytofit.report import agreement_page, agreement_table, trial_page
-from phytofit.results import prepare_folder, table_text, write_text
-from phytofit.simulation import simulate
-from phytofit.species import Species, load_species
-from phytofit.trials import ENOUGH, N_POINTS, N_VIEWS, Trial, needed, trial, trial_table, vary
-from phytofit.validation import Agreement, agreement, compare, read_measures, read_results
+from phytofit.cli.settings import defaults_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from phytofit.species import Species
+    from phytofit.trials import Trial
+    from phytofit.validation import Agreement
 
 __all__ = ["validate_command"]
 
 SHOWN = ("n", "bias", "RMSE", "R", "CCC", "covered")  # of an agreement, on the screen
-SIMULATE = defaults(simulate)
-SPECIES = defaults(fit)["species"]
+SIMULATE = defaults_of("simulation", "simulate")
+SPECIES = defaults_of("species", "load_species")["species"]
 
 
 @app.command("validate")
@@ -85,6 +80,10 @@ def validate_command(
 
         phytofit validate --simulate --noise 0.3 --points 2000 --views 3 --spheres 1
     """
+    from phytofit.results import prepare_folder
+    from phytofit.simulation import simulate
+    from phytofit.species import load_species
+
     if simulated in (truth is not None, results is not None):
         complain(
             "expected a folder of results with --truth measurements.csv, or --simulate without either: "
@@ -116,6 +115,10 @@ def validate_command(
 
 
 def _against_the_hand(results: Path, truth: Path, folder: Path) -> None:
+    from phytofit.report import agreement_page
+    from phytofit.results import prepare_folder
+    from phytofit.validation import agreement, compare, read_measures, read_results
+
     measures = or_exit(lambda: read_measures(truth))
     comparison = or_exit(lambda: compare(measures, read_results(results)))
     found = agreement(comparison.pairs)
@@ -135,9 +138,11 @@ def _against_the_hand(results: Path, truth: Path, folder: Path) -> None:
 
 
 def _tried(
-    sensor: Mapping[str, Any], species: Species, number: int, seed: int, threads: int | None
-) -> dict[str, dict[int, Trial]]:
+    sensor: Mapping[str, Any], species: "Species", number: int, seed: int, threads: int | None
+) -> "dict[str, dict[int, Trial]]":
     """The sensor as it was described (under 0), and with other numbers of points and of cameras."""
+    from phytofit.trials import N_POINTS, N_VIEWS, trial, vary
+
     steps = {
         "n_points": sorted({*N_POINTS, sensor["n_points"]}),
         "n_views": sorted({*N_VIEWS, *((sensor["n_views"],) if sensor["n_views"] else ())}),
@@ -160,7 +165,16 @@ def _tried(
         }
 
 
-def _tell(base: Trial, trials: Mapping[str, Mapping[int, Trial]], percent: float, degrees: float, folder: Path) -> None:
+def _tell(
+    base: "Trial", trials: "Mapping[str, Mapping[int, Trial]]", percent: float, degrees: float, folder: Path
+) -> None:
+    import pandas as pd
+
+    from phytofit.report import trial_page
+    from phytofit.results import table_text, write_text
+    from phytofit.trials import ENOUGH, needed, trial_table
+    from phytofit.validation import agreement
+
     found = agreement(base.comparison.pairs)
     needs = pd.concat([trial_table(name, made, percent, degrees) for name, made in trials.items()])
     answers = []
@@ -195,14 +209,20 @@ def _described(sensor: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _write(folder: Path, pairs: pd.DataFrame, found: Sequence[Agreement], page: str) -> None:
+def _write(folder: Path, pairs: "pd.DataFrame", found: "Sequence[Agreement]", page: str) -> None:
+    import pandas as pd
+
+    from phytofit.results import table_text, write_text
+
     statistics = pd.DataFrame(found).assign(outliers=["; ".join(a.outliers) for a in found])
     or_exit(lambda: write_text(folder / "pairs.csv", table_text(pairs)))
     or_exit(lambda: write_text(folder / "validation.csv", table_text(statistics)))
     or_exit(lambda: write_text(folder / "validation.html", page))
 
 
-def _show(found: Sequence[Agreement], title: str) -> None:
+def _show(found: "Sequence[Agreement]", title: str) -> None:
+    from phytofit.report import agreement_table
+
     shown = agreement_table(found)
     table = Table(title=title, box=SIMPLE_HEAD, pad_edge=False)
     for column in ("trait", *SHOWN):

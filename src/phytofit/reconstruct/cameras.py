@@ -106,15 +106,13 @@ class Camera:
         return np.stack(moved, axis=-1)
 
 
-CAMERAS = {  # typical units, without distortion: a calibration of your own camera is better
-    camera.name: camera
-    for camera in (
-        Camera(575.8, 575.8, 319.5, 239.5, 640, 480, name="kinect-v1"),
-        Camera(365.0, 365.0, 255.5, 211.5, 512, 424, name="kinect-v2"),
-        Camera(424.0, 424.0, 423.5, 239.5, 848, 480, name="realsense-d4xx"),  # D435 and D455 at 848 x 480
-        Camera(504.0, 504.0, 320.0, 333.0, 640, 576, name="azure-kinect"),  # narrow field of view, unbinned
-    )
+PRESETS = {  # fx fy cx cy width height; typical units, without distortion: a calibration of your own camera is better
+    "kinect-v1": (575.8, 575.8, 319.5, 239.5, 640, 480),
+    "kinect-v2": (365.0, 365.0, 255.5, 211.5, 512, 424),
+    "realsense-d4xx": (424.0, 424.0, 423.5, 239.5, 848, 480),  # D435 and D455 at 848 x 480
+    "azure-kinect": (504.0, 504.0, 320.0, 333.0, 640, 576),  # narrow field of view, unbinned
 }
+CAMERAS = {name: Camera(*numbers, name=name) for name, numbers in PRESETS.items()}
 NEEDED = ("fx", "fy", "cx", "cy", "width", "height")
 
 

@@ -2,7 +2,6 @@
 
 import tomllib
 from dataclasses import dataclass, replace
-from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from phytofit.bundled import species_folder, species_names
 from phytofit.errors import SettingError, SpeciesError
 from phytofit.models.phytomer import Phytomer
 from phytofit.parameters import Parameter, ParameterSpace
 
-__all__ = ["Species", "load_species", "species_names"]
+__all__ = ["Species", "load_species"]
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # no text, no true or false
 
@@ -62,11 +62,6 @@ class _File(BaseModel):
     parameters: dict[str, _Parameter]
 
 
-def species_names() -> list[str]:
-    """Names of the species that come with phytofit."""
-    return sorted(p.name.removesuffix(".toml") for p in _folder().iterdir() if p.name.endswith(".toml"))
-
-
 def load_species(species: str | Path = "sorghum") -> Species:
     """Read a species by name, or from a TOML file of the user's.
 
@@ -74,7 +69,7 @@ def load_species(species: str | Path = "sorghum") -> Species:
     from any one on.  Raises SpeciesError, which names the file, the key, and what was expected.
     """
     if str(species) in species_names():
-        text, where = _folder().joinpath(f"{species}.toml").read_text(encoding="utf-8"), f"{species}.toml"
+        text, where = species_folder().joinpath(f"{species}.toml").read_text(encoding="utf-8"), f"{species}.toml"
     else:
         text, where = _read(Path(species)), str(species)
     try:
@@ -86,10 +81,6 @@ def load_species(species: str | Path = "sorghum") -> Species:
         key = ".".join(str(part) for part in first["loc"])
         raise SpeciesError(f"{where}: {key}: {first['msg']} (got {first['input']!r:.60})") from None
     return _assemble(file, where)
-
-
-def _folder() -> "resources.abc.Traversable":
-    return resources.files("phytofit") / "species"
 
 
 def _read(path: Path) -> str:

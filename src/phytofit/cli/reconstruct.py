@@ -1,0 +1,113 @@
+"""The command that makes one cloud of depth images."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from phytofit.cli.console import app, complain, err, out
+from phytofit.cli.options import CameraOption, DepthUnitOption, OutOption, PatternOption, PosesOption, StepOption
+from phytofit.errors import PhytofitError
+
+if TYPE_CHECKING:
+    from phytofit.reconstruct import Reconstruction
+
+__all__ = ["reconstruct_command"]
+
+STAGES = 6  # that reconstruct tells of
+
+
+@app.command("reconstruct")
+def reconstruct_command(
+    images: Annotated[Path, typer.Argument(metavar="FOLDER", help="Depth images: 16-bit PNG or TIFF, or NPY.")],
+    camera: CameraOption,
+    step: StepOption = None,
+    unit: DepthUnitOption = None,
+    poses: PosesOption = None,
+    pattern: PatternOption = "*",
+    spacing: Annotated[
+        float | None,
+        typer.Option(help="Between points of the cloud, cm; by default that of neighbouring pixels on the plant."),
+    ] = None,
+    folder: OutOption = Path("reconstruction"),
+) -> None:
+    """Make one cloud of a plant from depth images of it on a turntable, or from known viewpoints.
+
+    The camera stands still and the plant turns, by about the same step between images, which are taken in the order of
+    the numbers in their names. What turns is the plant; background, table and pot are removed. Axis and step are found
+    from the images. Writes DIR/plant.ply (cm, z up, the number of views that saw each point), DIR/reconstruction.png
+    (three sides, to believe it by) and DIR/reconstruction.json (step, axis, the pose of each view, how well each pair
+    fits, views left out and why).
+
+    Examples:
+
+        phytofit reconstruct scan --camera kinect-v2 --out plant
+
+        phytofit reconstruct scan --camera my_camera.toml --step 30 --pattern 'depth_*.png'
+
+        phytofit reconstruct scan --camera realsense-d4xx --poses poses.json
+    """
+    from phytofit.reconstruct import reconstruct
+    from phytofit.results import prepare_folder, save_reconstruction
+
+    if images.is_dir() and images.resolve() == folder.resolve():
+        complain(f"{folder}: the folder of the images can't hold the results; name another with --out")
+        raise typer.Exit(2)
+    try:
+        prepare_folder(folder)
+        with Progress(
+            SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
+            console=err, transient=True, disable=not err.is_terminal,
+        ) as bar:  # fmt: skip
+            task = bar.add_task("images", total=STAGES)
+
+            def progress(stage: str) -> None:
+                bar.update(task, description=stage, advance=1)
+
+            result = reconstruct(
+                images,
+                camera,
+                step_deg=step,
+                unit=unit,
+                poses=poses,
+                pattern=pattern,
+                spacing_cm=spacing,
+                progress=progress,
+            )
+            save_reconstruction(result, folder)
+    except PhytofitError as error:
+        complain(error)
+        raise typer.Exit(2) from None
+    _print(result, folder)
+
+
+def _print(result: "Reconstruction", folder: Path) -> None:
+    table = Table(title=result.cloud.name)
+    for column in ("view", "angle, °", "fits", "overlap, %", "apart, cm"):
+        table.add_column(column, justify="left" if column in ("view", "fits") else "right", overflow="fold")
+    for i, file in enumerate(result.files):
+        mine = [pair for pair in result.pairs if i in (pair.first, pair.second)]
+        best = max(mine, key=lambda pair: pair.overlap, default=None)
+        angle = "" if result.turn is None else f"{math.degrees(abs(result.turn.angles[i])):.1f}"
+        if best is None:
+            table.add_row(file, angle, "", "", "")
+        else:
+            other = result.files[best.second if best.first == i else best.first]
+            table.add_row(file, angle, other, f"{100 * best.overlap:.0f}", f"{best.residual_cm:.2f}")
+    out.print(table)
+    for view in result.rejected:
+        out.print(f"[bold yellow]rejected:[/] {view.file}: {view.reason}", highlight=False)
+    for flag in result.flags:
+        out.print(f"[bold yellow]flag:[/] {flag}", highlight=False)
+    said = [f"{len(result.cloud)} points of {len(result.files)} views"]
+    if result.step_deg is not None:
+        said.append(f"step {abs(result.step_deg):.2f}°")
+    if result.pairs:
+        said.append(f"neighbours {result.residual_cm:.2f} cm apart (median)")
+    if result.loop is not None:
+        said.append(f"loop closes within {result.loop[0]:.1f}° and {result.loop[1]:.2f} cm")
+    where = f"{folder / 'plant.ply'}; believe it by {folder / 'reconstruction.png'}"
+    out.print(f"{', '.join(said)}: {where}", highlight=False)

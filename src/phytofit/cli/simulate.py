@@ -1,0 +1,124 @@
+"""The command that makes clouds whose truth is known."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from phytofit.cli.console import app, or_exit, out
+from phytofit.cli.options import (
+    NoiseOption,
+    NoiseReachOption,
+    OutliersOption,
+    OutOption,
+    Seed,
+    SpeciesOption,
+    SphereDiameterOption,
+    SpheresOption,
+    ViewsOption,
+)
+from phytofit.cli.settings import defaults_of
+from phytofit.errors import SettingError
+
+if TYPE_CHECKING:
+    from phytofit.simulation import SimulatedPhytomer
+    from phytofit.species import Species
+
+__all__ = ["simulate_command", "write_simulated"]
+
+SPECIES = defaults_of("species", "load_species")["species"]
+SIMULATE = defaults_of("simulation", "simulate")
+
+
+@app.command("simulate")
+def simulate_command(
+    folder: OutOption = Path("simulated"),
+    number: Annotated[int, typer.Option("--number", "-n", help="How many phytomers.", min=1)] = 1,
+    species: SpeciesOption = SPECIES,
+    parameters: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="NAME=VALUE fixes a parameter that is else drawn from the species' range."),
+    ] = None,
+    points: Annotated[int, typer.Option(help="Points on each, before spheres are removed.")] = SIMULATE["n_points"],
+    noise: NoiseOption = SIMULATE["noise_cm"],
+    noise_reach: NoiseReachOption = SIMULATE["noise_reach_cm"],
+    views: ViewsOption = SIMULATE["n_views"],
+    spheres: SpheresOption = SIMULATE["n_spheres"],
+    sphere_diameter: SphereDiameterOption = SIMULATE["sphere_diameter_cm"],
+    outliers: OutliersOption = SIMULATE["outlier_share"],
+    upright: Annotated[
+        bool, typer.Option("--upright", help="Stem along +z, leaf towards +x; else a random pose.")
+    ] = False,
+    seed: Seed = SIMULATE["seed"],
+) -> None:
+    """Draw phytomers from a species' ranges and scan them: clouds with their true parameters and traits.
+
+    Writes DIR/phytomer_0001.ply (cm, with labels) and phytomer_0001.json a phytomer, and DIR/truth.csv over all.
+
+    Example:
+
+        phytofit simulate --number 10 --noise 0.5 --spheres 1 --set leaf_length=60 --out simulated
+    """
+    import pandas as pd
+
+    from phytofit.results import prepare_folder, table_text, trait_table, write_text
+    from phytofit.simulation import simulate
+    from phytofit.species import load_species
+    from phytofit.traits import measure
+
+    chosen = or_exit(lambda: load_species(species))
+    fixed = or_exit(lambda: _parse_parameters(parameters or [], chosen))
+    or_exit(lambda: prepare_folder(folder))
+    tables = []
+    for i in range(number):
+        made = or_exit(
+            lambda i=i: simulate(
+                chosen,
+                fixed=fixed,
+                n_points=points,
+                noise_cm=noise,
+                noise_reach_cm=noise_reach,
+                n_views=views,
+                n_spheres=spheres,
+                sphere_diameter_cm=sphere_diameter,
+                outlier_share=outliers,
+                random_orientation=not upright,
+                seed=seed + i,
+            )
+        )
+        name = f"phytomer_{i + 1:04d}"
+        or_exit(lambda made=made, name=name: write_simulated(made, chosen, folder, name))
+        tables.append(trait_table(name, measure(made.organs, method="truth")))
+    or_exit(lambda: write_text(folder / "truth.csv", table_text(pd.concat(tables))))
+    out.print(f"{number} phytomers in {folder}, their true traits in {folder / 'truth.csv'}", highlight=False)
+
+
+def _parse_parameters(texts: list[str], species: "Species") -> dict[str, float]:
+    fixed = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            fixed[name] = float(value)
+        except ValueError:
+            raise SettingError(f"--set {text}: expected NAME=NUMBER, for example leaf_length=60") from None
+        species.space.index(name)
+    return fixed
+
+
+def write_simulated(
+    made: "SimulatedPhytomer", species: "Species", folder: Path, name: str, *, labels: bool = True
+) -> None:
+    """The cloud and a file with its truth."""
+    from phytofit.cloud import PointCloud, write_cloud
+    from phytofit.results import write_text
+    from phytofit.traits import measure
+
+    write_cloud(folder / f"{name}.ply", PointCloud(made.points, labels=made.labels if labels else None, name=name))
+    truth = {
+        "parameters": dict(zip(species.space.names, made.x.tolist(), strict=True)),
+        "traits": {t.name: t.value for t in measure(made.organs)},
+        "pose": made.pose.tolist(),
+        "units": "cm, deg",
+    }
+    write_text(folder / f"{name}.json", json.dumps(truth, indent=1) + "\n")
