@@ -21,7 +21,6 @@ LAYERS = [
     {"results"},
     {"report", "viewer", "export"},
     {"plots"},
-    {"trials"},
     {"validation"},
     {"recipe"},
     {"fitting", "simulation", "reconstruct"},

@@ -7,8 +7,8 @@ from typer.testing import CliRunner
 import phytofit
 from phytofit.cli import app
 from phytofit.cli.validate import _tell
-from phytofit.trials import MAIN_TRAITS, Trial, needed, share_within, trial, trial_table, vary
 from phytofit.validation import PAIR_COLUMNS, Comparison
+from phytofit.validation.trials import MAIN_TRAITS, Trial, needed, share_within, trial, trial_table, vary
 
 POSED = 1e-9  # a phytomer has the same traits in every pose, but for rounding
 SENSOR = {"n_points": 400, "noise_cm": 0.2}

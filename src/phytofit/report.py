@@ -10,8 +10,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from phytofit.plots import plot_agreement, plot_trials
-from phytofit.trials import Trial
 from phytofit.validation import Agreement, Comparison, agreement
+from phytofit.validation.trials import Trial
 
 __all__ = ["agreement_page", "agreement_table", "trial_page"]
 

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from phytofit.species import Species
-    from phytofit.trials import Trial
     from phytofit.validation import Agreement
+    from phytofit.validation.trials import Trial
 
 __all__ = ["validate_command"]
 
@@ -141,7 +141,7 @@ def _tried(
     sensor: Mapping[str, Any], species: "Species", number: int, seed: int, threads: int | None
 ) -> "dict[str, dict[int, Trial]]":
     """The sensor as it was described (under 0), and with other numbers of points and of cameras."""
-    from phytofit.trials import N_POINTS, N_VIEWS, trial, vary
+    from phytofit.validation.trials import N_POINTS, N_VIEWS, trial, vary
 
     steps = {
         "n_points": sorted({*N_POINTS, sensor["n_points"]}),
@@ -172,8 +172,8 @@ def _tell(
 
     from phytofit.report import trial_page
     from phytofit.results import table_text, write_text
-    from phytofit.trials import ENOUGH, needed, trial_table
     from phytofit.validation import agreement
+    from phytofit.validation.trials import ENOUGH, needed, trial_table
 
     found = agreement(base.comparison.pairs)
     needs = pd.concat([trial_table(name, made, percent, degrees) for name, made in trials.items()])

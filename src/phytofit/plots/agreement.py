@@ -49,7 +49,7 @@ def plot_agreement(pairs: pd.DataFrame, found: Agreement, against: str = "by han
 
 def plot_trials(table: pd.DataFrame, percent: float, degrees: float) -> Figure:
     """What more points and more cameras bring: the share of the results of each trait within so many per cent, or
-    degrees, of the truth, and their root mean square error.  ``table`` is that of :func:`phytofit.trials.trial_table`.
+    degrees, of the truth, and their root mean square error.  ``table`` is that of `trial_table`.
     """
     settings = list(dict.fromkeys(table["setting"]))
     figure = Figure(figsize=(5.0 * len(settings), 7.0), layout="constrained")

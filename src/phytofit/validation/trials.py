@@ -12,7 +12,8 @@ from phytofit.fitting import fit
 from phytofit.simulation import simulate
 from phytofit.species import Species, load_species
 from phytofit.traits import measure
-from phytofit.validation import PAIR_COLUMNS, Comparison, agreement
+from phytofit.validation.agreement import agreement
+from phytofit.validation.matching import PAIR_COLUMNS, Comparison
 
 __all__ = ["ENOUGH", "Trial", "needed", "share_within", "trial", "trial_table", "vary"]
 
