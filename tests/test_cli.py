@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from phytofit.results import COLUMNS, result_names
 
 FAST = ["--method", "paper", "--samples", "60", "--points", "500", "--generations", "3"]
 FILES = {"fit.json", "traits.csv", "model.ply", "fit.png", "convergence.png"}
+BESIDE = {"traits.csv", "phytofit.log"}
 
 
 def run(*arguments):
@@ -50,16 +52,23 @@ def test_simulate_writes_clouds_and_their_truth(clouds):
     assert set(np.unique(cloud.labels)) == {1, 2}
 
 
-def test_fit_measures_several_clouds_and_writes_everything(clouds, tmp_path):
-    done = run("fit", clouds / "phytomer_0001.ply", clouds / "phytomer_0002.ply", "-u", "cm", *FAST, "-o", tmp_path)
-    assert done.exit_code == 0, done.output
+@pytest.fixture(scope="module")
+def measured(clouds, tmp_path_factory):
+    """A cloud that can't be read and two that can, measured at once: the folder of the results, and what was said."""
+    folder = tmp_path_factory.mktemp("measured")
+    bad = folder / "bad.ply"
+    bad.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9999\nproperty float x\nend_header\n1\n")
+    both = (clouds / "phytomer_0001.ply", clouds / "phytomer_0002.ply")
+    return folder / "out", run("fit", bad, *both, "-u", "cm", *FAST, "--threads", 2, "-o", folder / "out")
+
+
+def test_fit_measures_several_clouds_and_writes_everything(measured):
+    folder, done = measured
     assert "leaf_length" in done.output
-    assert "2 of 2 clouds measured" in done.output
-    assert {p.name for p in tmp_path.iterdir()} == {"phytomer_0001", "phytomer_0002", "traits.csv"}
+    assert {p.name for p in folder.iterdir()} == {"phytomer_0001", "phytomer_0002", *BESIDE, "failed.csv"}
     for name in ("phytomer_0001", "phytomer_0002"):
-        folder = tmp_path / name
-        assert {p.name for p in folder.iterdir()} == FILES
-        stored = json.loads((folder / "fit.json").read_text())
+        assert {p.name for p in (folder / name).iterdir()} == FILES
+        stored = json.loads((folder / name / "fit.json").read_text())
         assert stored["cloud"] == name
         assert stored["parameters"]["leaf_length"] == {
             "value": pytest.approx(50.0, abs=8.0),
@@ -72,16 +81,28 @@ def test_fit_measures_several_clouds_and_writes_everything(clouds, tmp_path):
         assert stored["settings"]["fit"]["species"] == "sorghum"
         assert stored["phytofit"]
         assert len(stored["input"]["sha256"]) == 64
-        table = pd.read_csv(folder / "traits.csv")
+        table = pd.read_csv(folder / name / "traits.csv")
         assert list(table.columns) == COLUMNS
         assert table[["low", "high"]].isna().all().all()
         assert set(table.method) == {"paper"}
         for picture in ("fit.png", "convergence.png"):
-            image = matplotlib.image.imread(folder / picture)
+            image = matplotlib.image.imread(folder / name / picture)
             assert image.shape[0] > 600
             assert image[..., :3].std() > 0.05  # not blank
-    together = pd.read_csv(tmp_path / "traits.csv")
+    together = pd.read_csv(folder / "traits.csv")
     assert list(together.cloud.unique()) == ["phytomer_0001", "phytomer_0002"]
+
+
+def test_one_bad_cloud_does_not_stop_the_others(measured):
+    folder, done = measured
+    assert done.exit_code == 1
+    assert "2 of 3 clouds measured" in done.output
+    assert done.stderr.startswith("error: ")
+    assert "bad.ply" in done.stderr
+    failed = pd.read_csv(folder / "failed.csv")
+    assert failed["cloud"].tolist() == ["bad"]
+    assert "bad.ply" in failed["reason"][0]
+    assert "bad.ply" in (folder / "phytofit.log").read_text()
 
 
 def test_fit_by_default_writes_intervals_and_the_same_bytes_with_one_and_two_threads(clouds, tmp_path):
@@ -104,36 +125,41 @@ def test_fit_by_default_writes_intervals_and_the_same_bytes_with_one_and_two_thr
         assert (folder / name).read_bytes() == (tmp_path / "2" / "phytomer_0001" / name).read_bytes(), name
 
 
-def test_model_is_in_the_frame_and_unit_of_the_input(clouds, tmp_path):
-    cloud = phytofit.read_cloud(clouds / "phytomer_0001.ply", "cm")
-    far = np.array([500.0, -300.0, 200.0])
-    trimesh.PointCloud(cloud.points * 10.0 + far).export(tmp_path / "in_mm.ply")
-    done = run("fit", tmp_path / "in_mm.ply", "-u", "mm", *FAST, "-o", tmp_path / "out")
-    assert done.exit_code == 0, done.output
-    model = trimesh.load(tmp_path / "out" / "in_mm" / "model.ply")
-    read = phytofit.read_cloud(tmp_path / "in_mm.ply", "mm")
-    np.testing.assert_allclose(model.bounds, np.array([read.points.min(0), read.points.max(0)]) * 10.0, atol=60.0)
-
-
-def test_same_seed_same_bytes_with_one_and_two_threads(clouds, tmp_path):
-    for threads in (1, 2):
-        done = run(
-            "fit", clouds / "phytomer_0001.ply", "-u", "cm", *FAST, "--threads", threads, "-o", tmp_path / str(threads)
-        )
-        assert done.exit_code == 0, done.output
+def test_paper_gives_the_same_bytes_with_one_and_two_threads(measured, clouds, tmp_path):
+    assert run("fit", clouds / "phytomer_0001.ply", "-u", "cm", *FAST, "--threads", 1, "-o", tmp_path).exit_code == 0
     for name in FILES:
-        a, b = ((tmp_path / t / "phytomer_0001" / name).read_bytes() for t in ("1", "2"))
+        a, b = ((folder / "phytomer_0001" / name).read_bytes() for folder in (tmp_path, measured[0]))
         assert a == b, name
 
 
-def test_one_bad_cloud_does_not_stop_the_others(clouds, tmp_path):
-    bad = tmp_path / "bad.ply"
-    bad.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9999\nproperty float x\nend_header\n1\n")
-    done = run("fit", bad, clouds / "phytomer_0001.ply", "-u", "cm", *FAST, "-o", tmp_path / "out")
-    assert done.exit_code == 1
-    assert "1 of 2 clouds measured" in done.output
-    assert "bad.ply" in done.stderr
-    assert {p.name for p in (tmp_path / "out").iterdir()} == {"phytomer_0001", "traits.csv"}
+def test_a_second_run_adds_to_the_table_replaces_results_as_a_whole_and_keeps_what_is_the_users(
+    measured, clouds, tmp_path
+):
+    """The cloud that is new is in millimetres and far from the origin, and its model is there, too."""
+    folder = tmp_path / "out"
+    shutil.copytree(measured[0], folder)
+    (folder / "phytomer_0001" / "note.txt").write_text("mine")
+    (folder / "phytomer_0001" / "traits.csv").write_text("changed")
+    cloud = phytofit.read_cloud(clouds / "phytomer_0001.ply", "cm")
+    trimesh.PointCloud(cloud.points * 10.0 + [500.0, -300.0, 200.0]).export(tmp_path / "in_mm.ply")
+    again = clouds / "phytomer_0001.ply"
+    assert run("fit", tmp_path / "in_mm.ply", "-u", "mm", *FAST, "--mesh", "obj", "-o", folder).exit_code == 0
+    assert run("fit", again, "-u", "cm", *FAST, "--seed", "1", "--xlsx", "-o", folder).exit_code == 0
+    together = pd.read_csv(folder / "traits.csv")
+    assert list(together.cloud.unique()) == ["in_mm", "phytomer_0001", "phytomer_0002"]
+    assert len(pd.read_excel(folder / "traits.xlsx")) == len(together)
+    assert json.loads((folder / "phytomer_0001" / "fit.json").read_text())["seed"] == 1
+    assert {p.name for p in (folder / "phytomer_0001").iterdir()} == FILES | {"note.txt", "traits.yours.csv"}
+    assert (folder / "phytomer_0001" / "note.txt").read_text() == "mine"
+    assert (folder / "phytomer_0001" / "traits.yours.csv").read_text() == "changed"
+    read = phytofit.read_cloud(tmp_path / "in_mm.ply", "mm")
+    for model in ("model.ply", "model.obj"):
+        bounds = trimesh.load(folder / "in_mm" / model).bounds
+        np.testing.assert_allclose(bounds, np.array([read.points.min(0), read.points.max(0)]) * 10.0, atol=60.0)
+    assert {p.name for p in folder.iterdir()} == {
+        *("phytomer_0001", "phytomer_0002", "in_mm", "failed.csv", "traits.xlsx"),
+        *BESIDE,
+    }
 
 
 BAD_CLOUDS = {
@@ -148,18 +174,19 @@ BAD_CLOUDS = {
 }
 
 
-@pytest.mark.parametrize("name", BAD_CLOUDS)
-def test_bad_clouds_get_one_line_and_exit_code_2(tmp_path, name):
-    content, text = BAD_CLOUDS[name]
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    done = run("fit", tmp_path / name, "--units", "cm", *FAST, "-o", tmp_path / "out")
+def test_bad_clouds_get_one_line_each_and_exit_code_2(tmp_path):
+    for name, (content, _) in BAD_CLOUDS.items():
+        if content is not None:
+            (tmp_path / name).write_bytes(content)
+    done = run("fit", *(tmp_path / name for name in BAD_CLOUDS), "--units", "cm", *FAST, "-o", tmp_path / "out")
     assert done.exit_code == 2
-    assert done.stderr.startswith("error: ")
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert name in done.stderr
-    assert text in done.stderr
-    assert list((tmp_path / "out").iterdir()) == []
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == len(BAD_CLOUDS)
+    for line, (name, (_, text)) in zip(lines, BAD_CLOUDS.items(), strict=True):
+        assert line.startswith("error: ")
+        assert name in line
+        assert text in line
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"failed.csv", "phytofit.log"}
 
 
 def test_a_folder_and_a_bare_stem_are_refused(tmp_path):
@@ -207,14 +234,6 @@ def test_results_can_not_be_written_into_a_file(clouds, tmp_path):
     assert done.exit_code == 2
     assert "results can't be written there" in done.stderr
     assert (tmp_path / "file").read_text() == "mine"
-
-
-def test_a_second_run_replaces_the_first_as_a_whole(clouds, tmp_path):
-    for seed in (0, 1):
-        arguments = ["-u", "cm", *FAST, "--seed", seed, "-o", tmp_path]
-        assert run("fit", clouds / "phytomer_0001.ply", *arguments).exit_code == 0
-    assert {p.name for p in tmp_path.iterdir()} == {"phytomer_0001", "traits.csv"}
-    assert json.loads((tmp_path / "phytomer_0001" / "fit.json").read_text())["seed"] == 1
 
 
 def test_names_that_collide_take_the_parent_folder():

@@ -28,6 +28,7 @@ STEPS: dict[str, Callable[..., Any]] = {
     "distance_chamfer": chamfer,
     "distance_labels": labelled_hausdorff,
 }
+STEPS_OF = {"likelihood": ("remove_outliers",), "paper": ("remove_outliers", "objective")}  # beside fit
 NOT_SETTINGS = {
     "progress",
     "executor",
@@ -55,7 +56,11 @@ def recipe() -> dict[str, dict[str, Any]]:
 
 
 def recipe_of(result: Fit) -> dict[str, dict[str, Any]]:
-    """The recipe that made this result."""
-    made = {step: settings for step, settings in recipe().items() if step not in ("reconstruct", "segment")}
-    made["fit"] |= {"species": result.species.name, "seed": result.seed, **result.settings}
-    return made
+    """What made this result, no more: what `fit` was given or chose by itself, and the settings of the steps that its
+    method uses."""
+    used = {"species": result.species.name, "seed": result.seed, **result.settings}
+    steps = recipe()
+    made = {step: steps[step] for step in STEPS_OF[result.method] if step in steps}
+    if "distance" in used:
+        made |= {step: steps[step] for step in (f"distance_{used['distance']}",) if step in steps}
+    return {"fit": used, **{step: {k: v for k, v in found.items() if k not in used} for step, found in made.items()}}

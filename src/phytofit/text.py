@@ -9,7 +9,7 @@ import re
 
 from rich.markup import escape
 
-__all__ = ["for_file_name", "for_picture", "for_table", "for_terminal", "one_line"]
+__all__ = ["for_file_name", "for_picture", "for_table", "for_terminal", "from_table", "one_line"]
 
 FORMULA_STARTS = ("=", "+", "-", "@")  # with which a spreadsheet takes a cell for a formula (OWASP, CSV injection)
 MOST_NAME_BYTES = 200  # of a file name: most file systems take 255, and parts of files add to it
@@ -37,6 +37,12 @@ def for_table(text: object) -> str:
     """The text in one line; an apostrophe in front of what a spreadsheet would run as a formula."""
     line = one_line(text)
     return f"'{line}" if line.startswith(FORMULA_STARTS) else line
+
+
+def from_table(cell: object) -> str:
+    """What :func:`for_table` put into a cell, without its apostrophe."""
+    text = str(cell)
+    return text[1:] if text.startswith("'") and text[1:].startswith(FORMULA_STARTS) else text
 
 
 def for_file_name(text: object) -> str:

@@ -8,11 +8,12 @@ import typer
 from rich.console import Console
 
 from phytofit.errors import PhytofitError
+from phytofit.text import for_terminal
 
 if TYPE_CHECKING:
     from phytofit.cloud import PointCloud
 
-__all__ = ["app", "complain", "err", "or_exit", "out", "read_quietly"]
+__all__ = ["app", "complain", "err", "flag", "note", "or_exit", "out", "read_quietly", "tell"]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -25,8 +26,21 @@ out = Console()
 err = Console(stderr=True)
 
 
-def complain(error: Exception | str) -> None:
-    err.print(f"[bold red]error:[/] {' '.join(str(error).split())}", highlight=False, soft_wrap=True)
+def tell(text: object) -> None:
+    """Print a line, whatever names it holds."""
+    out.print(for_terminal(text), highlight=False)
+
+
+def note(text: object) -> None:
+    out.print(f"note: {for_terminal(text)}", highlight=False)
+
+
+def flag(text: object) -> None:
+    out.print(f"[bold yellow]flag:[/] {for_terminal(text)}", highlight=False)
+
+
+def complain(error: object) -> None:
+    err.print(f"[bold red]error:[/] {for_terminal(error)}", highlight=False, soft_wrap=True)
 
 
 def or_exit(call: Any) -> Any:

@@ -7,11 +7,22 @@ import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from phytofit.cli.console import app, complain, err, or_exit, out, read_quietly
-from phytofit.cli.options import OutOption, Seed, SpeciesOption, ThreadsOption, UnitsOption, UpOption
+from phytofit.cli.console import app, err, or_exit, out, read_quietly, tell
+from phytofit.cli.each import measure_each
+from phytofit.cli.options import (
+    MeshOption,
+    OutOption,
+    Seed,
+    SpeciesOption,
+    ThreadsOption,
+    UnitsOption,
+    UpOption,
+    WorkbookOption,
+)
 from phytofit.cli.settings import defaults_of, entries_of
 from phytofit.cli.tables import interval, print_remarks
-from phytofit.errors import PhytofitError, SettingError
+from phytofit.errors import SettingError
+from phytofit.text import for_terminal
 
 if TYPE_CHECKING:
     from phytofit.cloud import PointCloud
@@ -80,6 +91,8 @@ def fit_command(
     seed: Seed = FIT["seed"],
     threads: ThreadsOption = None,
     folder: OutOption = Path("results"),
+    mesh: MeshOption = None,
+    workbook: WorkbookOption = False,
 ) -> None:
     """Measure phytomers: one leaf on its piece of stem a cloud, in any orientation.
 
@@ -94,16 +107,14 @@ def fit_command(
 
         phytofit fit crowded.ply --units cm --seed-point 12.5,-3,40
     """
-    import pandas as pd
-
     from phytofit.parsing import parse_up
-    from phytofit.results import prepare_folder, result_names, save_fit, table_text, trait_table, write_text
+    from phytofit.results import check_meshes, fit_tables, save_fit
     from phytofit.species import load_species
 
     seed_points = or_exit(lambda: _seed_points(seed_point or [], len(clouds)))
     chosen = or_exit(lambda: load_species(species))
-    or_exit(lambda: prepare_folder(folder))
     or_exit(lambda: parse_up(up))
+    meshes = or_exit(lambda: check_meshes(mesh or []))
     settings: dict[str, Any] = {
         "species": chosen,
         "up": up,
@@ -118,24 +129,16 @@ def fit_command(
         "seed": seed,
         "threads": threads,
     }
-    tables = []
-    for path, name in zip(clouds, result_names(clouds), strict=True):
-        try:
-            cloud = read_quietly(path, units, labels)
-            result = fit_with_progress(cloud, name, settings)
-            where = save_fit(result, cloud, folder, name)
-        except SettingError as error:  # as wrong for every other cloud
-            complain(error)
-            raise typer.Exit(2) from None
-        except PhytofitError as error:
-            complain(error if str(path) in str(error) or path.name in str(error) else f"{path}: {error}")
-            continue
-        tables.append(trait_table(name, result.traits))
-        _print_fit(result, name, where)
-    if tables:
-        or_exit(lambda: write_text(folder / "traits.csv", table_text(pd.concat(tables))))
-        out.print(f"{len(tables)} of {len(clouds)} clouds measured: {folder / 'traits.csv'}", highlight=False)
-    raise typer.Exit(0 if len(tables) == len(clouds) else 1 if tables else 2)
+
+    def measured(path: Path, name: str) -> "Fit":
+        cloud = read_quietly(path, units, labels)
+        result = fit_with_progress(cloud, name, settings)
+        save_fit(result, cloud, folder, name, meshes=meshes)
+        return result
+
+    measure_each(
+        clouds, folder, measured, fit_tables, _print_fit, f"clouds measured: {folder / 'traits.csv'}", workbook=workbook
+    )
 
 
 def _seed_points(given: list[str], n_clouds: int) -> list[list[float]] | None:
@@ -158,17 +161,17 @@ def fit_with_progress(cloud: "PointCloud", name: str, settings: dict[str, Any]) 
     generations = settings.get("n_generations") or by_default
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[errors]}"))
     with Progress(*columns, TimeElapsedColumn(), console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(f"{name}: start pose", total=generations, errors="")
+        task = bar.add_task(f"{for_terminal(name)}: start pose", total=generations, errors="")
 
         def told(generation: "Generation") -> None:
             errors = f"best {generation.best_error:.2f}, elite {generation.threshold:.2f}"
-            bar.update(task, completed=generation.index, description=f"{name}: search", errors=errors)
+            bar.update(task, completed=generation.index, description=f"{for_terminal(name)}: search", errors=errors)
 
         return fit(cloud, progress=told, **settings)
 
 
 def _print_fit(result: "Fit", name: str, where: Path) -> None:
-    table = Table(title=name)
+    table = Table(title=for_terminal(name))
     for column in ("organ", "trait", "value", "95 % interval", "unit"):
         table.add_column(column, justify="right" if column in ("value", "95 % interval") else "left")
     for trait in result.traits:
@@ -184,4 +187,4 @@ def _print_fit(result: "Fit", name: str, where: Path) -> None:
             f"noise {stem:.2f} {unit} on the stem, {leaf:.2f} on the leaf, {thickness:.2f} more across it; "
             f"{100 * result.estimate.share[2]:.0f} % outliers"
         )
-    out.print(f"{said}; model on the points: {where / 'fit.png'}", highlight=False)
+    tell(f"{said}; model on the points: {where / 'fit.png'}")

@@ -12,6 +12,7 @@ __all__ = [
     "CameraOption",
     "DepthUnitOption",
     "LabelsOption",
+    "MeshOption",
     "NoiseOption",
     "NoiseReachOption",
     "OutOption",
@@ -27,6 +28,7 @@ __all__ = [
     "UnitsOption",
     "UpOption",
     "ViewsOption",
+    "WorkbookOption",
 ]
 
 AXES = ", ".join(entries_of("parsing", "AXES"))
@@ -41,6 +43,11 @@ UnitsOption = Annotated[
     str | None, typer.Option("--units", "-u", help="Unit of the coordinates: cm, mm, m; none: relative lengths.")
 ]
 UpOption = Annotated[str | None, typer.Option(help=f"Upward direction where it is known: {AXES}.")]
+MeshOption = Annotated[
+    list[str] | None,
+    typer.Option(help="The model also as obj or glb, each organ a named part; repeat for both."),
+]
+WorkbookOption = Annotated[bool, typer.Option("--xlsx", help="The table also as traits.xlsx.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.", file_okay=True)]
 NoiseOption = Annotated[float, typer.Option(help="Gaussian noise a coordinate, cm.")]
 NoiseReachOption = Annotated[

@@ -8,9 +8,10 @@ import typer
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from phytofit.cli.console import app, complain, err, out
+from phytofit.cli.console import app, complain, err, flag, out, tell
 from phytofit.cli.options import CameraOption, DepthUnitOption, OutOption, PatternOption, PosesOption, StepOption
 from phytofit.errors import PhytofitError
+from phytofit.text import for_terminal
 
 if TYPE_CHECKING:
     from phytofit.reconstruct import Reconstruction
@@ -51,13 +52,14 @@ def reconstruct_command(
         phytofit reconstruct scan --camera realsense-d4xx --poses poses.json
     """
     from phytofit.reconstruct import reconstruct
-    from phytofit.results import prepare_folder, save_reconstruction
+    from phytofit.results import check_reconstruction, prepare_folder, save_reconstruction
 
     if images.is_dir() and images.resolve() == folder.resolve():
         complain(f"{folder}: the folder of the images can't hold the results; name another with --out")
         raise typer.Exit(2)
     try:
         prepare_folder(folder)
+        check_reconstruction(folder)
         with Progress(
             SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
             console=err, transient=True, disable=not err.is_terminal,
@@ -85,7 +87,7 @@ def reconstruct_command(
 
 
 def _print(result: "Reconstruction", folder: Path) -> None:
-    table = Table(title=result.cloud.name)
+    table = Table(title=for_terminal(result.cloud.name))
     for column in ("view", "angle, °", "fits", "overlap, %", "apart, cm"):
         table.add_column(column, justify="left" if column in ("view", "fits") else "right", overflow="fold")
     for i, file in enumerate(result.files):
@@ -93,15 +95,15 @@ def _print(result: "Reconstruction", folder: Path) -> None:
         best = max(mine, key=lambda pair: pair.overlap, default=None)
         angle = "" if result.turn is None else f"{math.degrees(abs(result.turn.angles[i])):.1f}"
         if best is None:
-            table.add_row(file, angle, "", "", "")
+            table.add_row(for_terminal(file), angle, "", "", "")
         else:
-            other = result.files[best.second if best.first == i else best.first]
-            table.add_row(file, angle, other, f"{100 * best.overlap:.0f}", f"{best.residual_cm:.2f}")
+            other = for_terminal(result.files[best.second if best.first == i else best.first])
+            table.add_row(for_terminal(file), angle, other, f"{100 * best.overlap:.0f}", f"{best.residual_cm:.2f}")
     out.print(table)
     for view in result.rejected:
-        out.print(f"[bold yellow]rejected:[/] {view.file}: {view.reason}", highlight=False)
-    for flag in result.flags:
-        out.print(f"[bold yellow]flag:[/] {flag}", highlight=False)
+        out.print(f"[bold yellow]rejected:[/] {for_terminal(f'{view.file}: {view.reason}')}", highlight=False)
+    for text in result.flags:
+        flag(text)
     said = [f"{len(result.cloud)} points of {len(result.files)} views"]
     if result.step_deg is not None:
         said.append(f"step {abs(result.step_deg):.2f}°")
@@ -110,4 +112,4 @@ def _print(result: "Reconstruction", folder: Path) -> None:
     if result.loop is not None:
         said.append(f"loop closes within {result.loop[0]:.1f}° and {result.loop[1]:.2f} cm")
     where = f"{folder / 'plant.ply'}; believe it by {folder / 'reconstruction.png'}"
-    out.print(f"{', '.join(said)}: {where}", highlight=False)
+    tell(f"{', '.join(said)}: {where}")

@@ -9,7 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from phytofit.cli.console import app, err, or_exit, out
+from phytofit.cli.console import app, err, flag, note, or_exit, out, tell
 from phytofit.cli.options import (
     CameraOption,
     DepthUnitOption,
@@ -103,13 +103,13 @@ def run_command(
             )
         )
     _print_plant(made)
-    out.print(f"Look at {folder / 'plant.png'}; all traits: {folder / 'traits.csv'}", highlight=False)
+    tell(f"Look at {folder / 'plant.png'}; all traits: {folder / 'traits.csv'}")
 
 
 def _print_plant(made: "PlantRun") -> None:
     whole = made.table[made.table["organ"] == "plant"].set_index("trait")[["value", "unit"]].to_dict("index")
     said = [f"{str(trait).replace('_', ' ')} {row['value']:.3g} {row['unit']}" for trait, row in whole.items()]
-    out.print(f"{made.segmentation.cloud.name}: {', '.join(said).replace(' 1,', ',')}", highlight=False)
+    tell(f"{made.segmentation.cloud.name}: {', '.join(said).replace(' 1,', ',')}")
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for column in ("leaf", *SHOWN.values()):
         table.add_column(column, justify="right", no_wrap=True)
@@ -119,11 +119,11 @@ def _print_plant(made: "PlantRun") -> None:
         table.add_row(str(rank), *(_with_interval(of_leaf, trait) for trait in SHOWN))
     out.print(table)
     for text in made.notes:
-        out.print(f"note: {text}", highlight=False)
+        note(text)
     for text in made.flags:
-        out.print(f"[bold yellow]flag:[/] {text}", highlight=False)
+        flag(text)
     if made.skipped:
-        out.print(f"up to date, not done again: {', '.join(made.skipped)}", highlight=False)
+        tell(f"up to date, not done again: {', '.join(made.skipped)}")
 
 
 def _with_interval(traits: "pd.DataFrame", name: str) -> str:

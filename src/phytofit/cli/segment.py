@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from phytofit.cli.console import app, complain, err, or_exit, out, read_quietly
+from phytofit.cli.console import app, err, flag, note, or_exit, out, read_quietly, tell
+from phytofit.cli.each import measure_each
 from phytofit.cli.options import LabelsOption, OutOption, UnitsOption, UpOption
-from phytofit.errors import PhytofitError
+from phytofit.text import for_terminal
 
 if TYPE_CHECKING:
     from phytofit.segmentation import Segmentation
@@ -38,45 +39,36 @@ def segment_command(
 
         phytofit segment corrected.ply --units mm --labels label
     """
-    import pandas as pd
-
     from phytofit.parsing import parse_up
     from phytofit.pipeline import PLANT_CM
-    from phytofit.results import leaf_table, prepare_folder, result_names, save_segmentation, table_text, write_text
+    from phytofit.results import leaf_tables, save_segmentation
     from phytofit.segmentation import segment
 
-    or_exit(lambda: prepare_folder(folder))
+    def taken_apart(path: Path, name: str) -> "Segmentation":
+        with err.status(f"{for_terminal(name)}: looking for stem and leaves"):
+            cloud = read_quietly(path, units, labels or "label", plausible_cm=PLANT_CM)
+            result = segment(cloud, up=up, labelled=labels is not None)
+            save_segmentation(result, folder, name)
+            return result
+
     or_exit(lambda: parse_up(up))
-    tables = []
-    for path, name in zip(clouds, result_names(clouds), strict=True):
-        try:
-            with err.status(f"{name}: looking for stem and leaves"):
-                cloud = read_quietly(path, units, labels or "label", plausible_cm=PLANT_CM)
-                result = segment(cloud, up=up, labelled=labels is not None)
-                where = save_segmentation(result, folder, name)
-        except PhytofitError as error:
-            complain(error if str(path) in str(error) or path.name in str(error) else f"{path}: {error}")
-            continue
-        tables.append(leaf_table(name, result))
-        _print_leaves(result, name, where)
-    if tables:
-        or_exit(lambda: write_text(folder / "leaves.csv", table_text(pd.concat(tables))))
-        out.print(f"{len(tables)} of {len(clouds)} plants taken apart: {folder / 'leaves.csv'}", highlight=False)
-    raise typer.Exit(0 if len(tables) == len(clouds) else 1 if tables else 2)
+    measure_each(
+        clouds, folder, taken_apart, leaf_tables, _print_leaves, f"plants taken apart: {folder / 'leaves.csv'}"
+    )
 
 
 def _print_leaves(result: "Segmentation", name: str, where: Path) -> None:
     unit = "rel" if result.cloud.unit == "none" else "cm"
-    table = Table(title=f"{name}: {len(result.leaves)} leaves")
+    table = Table(title=f"{for_terminal(name)}: {len(result.leaves)} leaves")
     for column in ("leaf", f"collar along the stem, {unit}", f"length, {unit}", "azimuth, deg", "points"):
         table.add_column(column, justify="right")
     for leaf in result.leaves:
         numbers = (f"{leaf.collar_distance:.1f}", f"{leaf.length:.1f}", f"{leaf.azimuth:.0f}", str(leaf.n_points))
         table.add_row(str(leaf.rank), *numbers)
     out.print(table)
-    for note in (*result.cloud.notes, *result.notes):
-        out.print(f"note: {note}", highlight=False)
+    for text in (*result.cloud.notes, *result.notes):
+        note(text)
     for leaf in result.leaves:
-        for flag in leaf.flags:
-            out.print(f"[bold yellow]flag:[/] leaf {leaf.rank}: {flag}", highlight=False)
-    out.print(f"Look at {where / 'segmentation.png'}", highlight=False)
+        for text in leaf.flags:
+            flag(f"leaf {leaf.rank}: {text}")
+    tell(f"Look at {where / 'segmentation.png'}")

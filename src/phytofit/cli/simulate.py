@@ -1,12 +1,11 @@
 """The command that makes clouds whose truth is known."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from phytofit.cli.console import app, or_exit, out
+from phytofit.cli.console import app, or_exit, tell
 from phytofit.cli.options import (
     NoiseOption,
     NoiseReachOption,
@@ -22,10 +21,9 @@ from phytofit.cli.settings import defaults_of
 from phytofit.errors import SettingError
 
 if TYPE_CHECKING:
-    from phytofit.simulation import SimulatedPhytomer
     from phytofit.species import Species
 
-__all__ = ["simulate_command", "write_simulated"]
+__all__ = ["simulate_command"]
 
 SPECIES = defaults_of("species", "load_species")["species"]
 SIMULATE = defaults_of("simulation", "simulate")
@@ -62,7 +60,7 @@ def simulate_command(
     """
     import pandas as pd
 
-    from phytofit.results import prepare_folder, table_text, trait_table, write_text
+    from phytofit.results import clear_simulated, prepare_folder, save_simulated, trait_table, write_table
     from phytofit.simulation import simulate
     from phytofit.species import load_species
     from phytofit.traits import measure
@@ -70,6 +68,7 @@ def simulate_command(
     chosen = or_exit(lambda: load_species(species))
     fixed = or_exit(lambda: _parse_parameters(parameters or [], chosen))
     or_exit(lambda: prepare_folder(folder))
+    or_exit(lambda: clear_simulated(folder))
     tables = []
     for i in range(number):
         made = or_exit(
@@ -88,10 +87,10 @@ def simulate_command(
             )
         )
         name = f"phytomer_{i + 1:04d}"
-        or_exit(lambda made=made, name=name: write_simulated(made, chosen, folder, name))
+        or_exit(lambda made=made, name=name: save_simulated(made, chosen, folder, name))
         tables.append(trait_table(name, measure(made.organs, method="truth")))
-    or_exit(lambda: write_text(folder / "truth.csv", table_text(pd.concat(tables))))
-    out.print(f"{number} phytomers in {folder}, their true traits in {folder / 'truth.csv'}", highlight=False)
+    or_exit(lambda: write_table(folder / "truth.csv", pd.concat(tables)))
+    tell(f"{number} phytomers in {folder}, their true traits in {folder / 'truth.csv'}")
 
 
 def _parse_parameters(texts: list[str], species: "Species") -> dict[str, float]:
@@ -104,21 +103,3 @@ def _parse_parameters(texts: list[str], species: "Species") -> dict[str, float]:
             raise SettingError(f"--set {text}: expected NAME=NUMBER, for example leaf_length=60") from None
         species.space.index(name)
     return fixed
-
-
-def write_simulated(
-    made: "SimulatedPhytomer", species: "Species", folder: Path, name: str, *, labels: bool = True
-) -> None:
-    """The cloud and a file with its truth."""
-    from phytofit.cloud import PointCloud, write_cloud
-    from phytofit.results import write_text
-    from phytofit.traits import measure
-
-    write_cloud(folder / f"{name}.ply", PointCloud(made.points, labels=made.labels if labels else None, name=name))
-    truth = {
-        "parameters": dict(zip(species.space.names, made.x.tolist(), strict=True)),
-        "traits": {t.name: t.value for t in measure(made.organs)},
-        "pose": made.pose.tolist(),
-        "units": "cm, deg",
-    }
-    write_text(folder / f"{name}.json", json.dumps(truth, indent=1) + "\n")

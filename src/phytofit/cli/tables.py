@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from phytofit.cli.console import out
+from phytofit.cli.console import flag, note
 
 if TYPE_CHECKING:
     from phytofit.fitted import Fit
@@ -17,7 +17,7 @@ def interval(trait: "Trait") -> str:
 
 
 def print_remarks(result: "Fit") -> None:
-    for note in result.notes:
-        out.print(f"note: {note}", highlight=False)
-    for flag in result.flags:
-        out.print(f"[bold yellow]flag:[/] {flag}", highlight=False)
+    for text in result.notes:
+        note(text)
+    for text in result.flags:
+        flag(text)

@@ -171,7 +171,7 @@ def _tell(
     import pandas as pd
 
     from phytofit.report import trial_page
-    from phytofit.results import table_text, write_text
+    from phytofit.results import write_table
     from phytofit.validation import agreement
     from phytofit.validation.trials import ENOUGH, needed, trial_table
 
@@ -190,7 +190,7 @@ def _tell(
                 answers.append(f"{said}not with up to {max(made):,} {name} (at best in {100 * most:.0f} %)")
     title = f"{base.n} simulated phytomers, {_described(base.sensor)}"
     _write(folder, base.comparison.pairs, found, trial_page(base, needs, answers, percent, degrees, title))
-    or_exit(lambda: write_text(folder / "needs.csv", table_text(needs)))
+    or_exit(lambda: write_table(folder / "needs.csv", needs))
     _show(found, title)
     for text in (*base.comparison.unmatched, *answers):
         out.print(text, highlight=False)
@@ -212,11 +212,11 @@ def _described(sensor: Mapping[str, Any]) -> str:
 def _write(folder: Path, pairs: "pd.DataFrame", found: "Sequence[Agreement]", page: str) -> None:
     import pandas as pd
 
-    from phytofit.results import table_text, write_text
+    from phytofit.results import write_table, write_text
 
     statistics = pd.DataFrame(found).assign(outliers=["; ".join(a.outliers) for a in found])
-    or_exit(lambda: write_text(folder / "pairs.csv", table_text(pairs)))
-    or_exit(lambda: write_text(folder / "validation.csv", table_text(statistics)))
+    or_exit(lambda: write_table(folder / "pairs.csv", pairs))
+    or_exit(lambda: write_table(folder / "validation.csv", statistics))
     or_exit(lambda: write_text(folder / "validation.html", page))
 
 

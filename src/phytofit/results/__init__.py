@@ -1,21 +1,73 @@
-"""What results look like on disk: nothing half-written."""
+"""What results look like on disk: nothing half-written, nothing lost."""
 
-from phytofit.results.files import prepare_folder, result_names, table_text, whole_file, whole_folder, write_text
-from phytofit.results.phytomer import COLUMNS, save_fit, trait_table
-from phytofit.results.plant import leaf_table, read_segmentation, save_reconstruction, save_segmentation
+from phytofit.results.files import files_made, json_text, result_names, write_text
+from phytofit.results.log import LOG, open_log
+from phytofit.results.models import MESHES, check_meshes, write_mesh
+from phytofit.results.phytomer import COLUMNS, fit_tables, save_fit, trait_table
+from phytofit.results.plant import (
+    check_reconstruction,
+    leaf_table,
+    leaf_tables,
+    read_segmentation,
+    save_reconstruction,
+    save_segmentation,
+)
+from phytofit.results.replacing import (
+    check_made,
+    delete_made,
+    file_hash,
+    made_in,
+    prepare_folder,
+    whole_file,
+    whole_files,
+    whole_folder,
+)
+from phytofit.results.simulated import clear_simulated, save_simulated
+from phytofit.results.tables import (
+    FolderTable,
+    check_table,
+    read_table,
+    table_text,
+    write_failures,
+    write_table,
+    write_workbook,
+)
 
 __all__ = [
     "COLUMNS",
+    "LOG",
+    "MESHES",
+    "FolderTable",
+    "check_made",
+    "check_meshes",
+    "check_reconstruction",
+    "check_table",
+    "clear_simulated",
+    "delete_made",
+    "file_hash",
+    "files_made",
+    "fit_tables",
+    "json_text",
     "leaf_table",
+    "leaf_tables",
+    "made_in",
+    "open_log",
     "prepare_folder",
     "read_segmentation",
+    "read_table",
     "result_names",
     "save_fit",
     "save_reconstruction",
     "save_segmentation",
+    "save_simulated",
     "table_text",
     "trait_table",
     "whole_file",
+    "whole_files",
     "whole_folder",
+    "write_failures",
+    "write_mesh",
+    "write_table",
     "write_text",
+    "write_workbook",
 ]

@@ -1,108 +1,83 @@
-"""Files of results: whole or not at all, with names that do not collide."""
+"""Files of results: their names, which do not collide, and what stands in them."""
 
 import hashlib
-import os
-import shutil
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import itertools
+import json
+import unicodedata
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from phytofit.cloud import PointCloud
-from phytofit.errors import OutputError
+from phytofit.errors import CloudError
+from phytofit.results.replacing import file_hash, whole_file
+from phytofit.text import for_file_name, one_line
 
-__all__ = ["input_of", "prepare_folder", "result_names", "table_text", "whole_file", "whole_folder", "write_text"]
+__all__ = ["files_made", "input_of", "json_text", "result_names", "write_text"]
 
-DIGITS = 6  # significant, in tables; fit.json has all
+RESERVED = (  # what commands write beside the folders of results
+    *("traits.csv", "traits.xlsx", "leaves.csv", "leaves.xlsx", "failed.csv", "phytofit.log", "truth.csv", "plant.png"),
+    *("reconstruction", "segmentation", "leaves"),
+)
 
 
 def result_names(paths: Sequence[Path]) -> list[str]:
-    """A name for each cloud: its file's stem; names that collide take the parent folder's name in front, then the
-    file's ending behind, then a number."""
+    """A name for each cloud that a folder can have on any system: its file's stem; names that collide, also but for
+    case, take the parent folder's name in front, then the file's ending behind, then a number."""
     folders = [path.resolve().parent.name for path in paths]
     names = [path.stem for path in paths]
     for longer in (
         [f"{folder}_{path.stem}" for folder, path in zip(folders, paths, strict=True)],
         [f"{folder}_{path.name.replace('.', '_')}" for folder, path in zip(folders, paths, strict=True)],
-        [f"{folder}_{path.stem}_{i}" for i, (folder, path) in enumerate(zip(folders, paths, strict=True), start=1)],
     ):
-        names = [long if names.count(name) > 1 else name for name, long in zip(names, longer, strict=True)]
-    return names
+        n_alike = Counter(_alike(name) for name in (*names, *RESERVED))
+        names = [long if n_alike[_alike(name)] > 1 else name for name, long in zip(names, longer, strict=True)]
+    n_alike = Counter(_alike(name) for name in (*names, *RESERVED))
+    taken, unique = set(n_alike), []
+    for name in map(for_file_name, names):
+        numbered = (f"{name}_{i}" for i in itertools.count(1))
+        alone = n_alike[_alike(name)] == 1
+        unique.append(name if alone else next(it for it in numbered if _alike(it) not in taken))
+        taken.add(_alike(unique[-1]))
+    return unique
+
+
+def _alike(name: str) -> str:
+    """The same for names that some file system takes for one: that ignores case, or how an umlaut is composed."""
+    return unicodedata.normalize("NFC", for_file_name(name)).casefold()
 
 
 def input_of(cloud: PointCloud) -> dict[str, Any]:
     """What a result says of its input: the file, its unit, and the SHA-256 of the file, or of the points where there is
-    none."""
-    data = np.ascontiguousarray(cloud.points).tobytes() if cloud.source is None else cloud.source.read_bytes()
+    none.  CloudError if the file can't be read any more."""
+    if cloud.source is None:
+        found = hashlib.sha256(np.ascontiguousarray(cloud.points).tobytes()).hexdigest()
+    else:
+        found = file_hash(cloud.source) or ""
+        if not found:
+            raise CloudError(f"{cloud.source}: it can't be read any more; leave it in its place until it is measured")
     return {
-        "file": None if cloud.source is None else cloud.source.name,
-        "sha256": hashlib.sha256(data).hexdigest(),
+        "file": None if cloud.source is None else one_line(cloud.source.name),
+        "sha256": found,
         "unit": cloud.unit,
     }
 
 
-def prepare_folder(folder: Path) -> Path:
-    """Make sure that results can be written to the folder; OutputError if not."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: results can't be written there ({error.strerror}); name another folder with --out"
-        ) from None
-    return folder
+def files_made(folder: Path) -> dict[str, str | None]:
+    """SHA-256 of each file in a folder, by its path there: what a result's record says of the others."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): file_hash(path) for path in files}
 
 
-@contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A hidden file to write into, which becomes ``path`` when all is written."""
-    part = path.with_name(f".{path.name}.part-{os.getpid()}")
-    try:
-        yield part
-        part.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path}: can't be written ({error.strerror})") from None
-    finally:
-        part.unlink(missing_ok=True)
+def json_text(said: Mapping[str, Any]) -> str:
+    """JSON that every reader takes: ASCII, and no numbers that are not finite (ValueError)."""
+    return json.dumps(said, indent=1, allow_nan=False) + "\n"
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a whole file or nothing."""
     with whole_file(path) as part:
         part.write_text(text, encoding="utf-8", newline="")
-
-
-def table_text(table: pd.DataFrame) -> str:
-    """The table as CSV, `DIGITS` significant digits, empty where there is no value."""
-    text: str = table.to_csv(index=False, float_format=f"%.{DIGITS}g", lineterminator="\n")
-    return text
-
-
-@contextmanager
-def whole_folder(folder: Path, name: str, mark: str) -> Iterator[Path]:
-    """A hidden folder to write into; when all is written it becomes ``folder/name``, in the place of an older one.
-
-    Raises OutputError where there is a folder of that name without the file `mark`, which is no result of ours.
-    """
-    folder = prepare_folder(folder)
-    target = folder / name
-    if target.exists() and not (target / mark).is_file() and not (target.is_dir() and not any(target.iterdir())):
-        raise OutputError(f"{target}: it is there already, and holds no {mark} of an earlier run; name another --out")
-    part = Path(tempfile.mkdtemp(prefix=f".{name}.part-", dir=folder))
-    try:
-        part.chmod(0o755)
-        yield part
-        if target.exists():
-            shutil.rmtree(target)
-        part.rename(target)
-    except OutputError:
-        raise
-    except OSError as error:
-        raise OutputError(f"{target}: the result can't be written ({error.strerror})") from None
-    finally:
-        shutil.rmtree(part, ignore_errors=True)

@@ -1,7 +1,6 @@
 """What a fit looks like on disk: one folder a cloud, and a tidy table."""
 
-import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -10,14 +9,18 @@ import numpy as np
 import pandas as pd
 
 from phytofit.cloud import PointCloud
+from phytofit.errors import NoPhytomerError
 from phytofit.fitted import Fit
-from phytofit.models import mesh
 from phytofit.plots import plot_convergence, plot_fit
 from phytofit.recipe import recipe_of
-from phytofit.results.files import input_of, table_text, whole_folder
+from phytofit.results.files import files_made, input_of, json_text
+from phytofit.results.models import write_mesh
+from phytofit.results.replacing import whole_folder
+from phytofit.results.tables import FolderTable, write_table
+from phytofit.text import for_file_name
 from phytofit.traits import Trait
 
-__all__ = ["COLUMNS", "save_fit", "trait_table"]
+__all__ = ["COLUMNS", "fit_tables", "save_fit", "trait_table"]
 
 COLUMNS = ["cloud", "plant", "organ", "rank", "trait", "value", "unit", "low", "high", "method", "flags"]
 
@@ -34,21 +37,40 @@ def trait_table(name: str, traits: Iterable[Trait], *, plant: int = 1) -> pd.Dat
     return pd.DataFrame(rows, columns=COLUMNS).astype({"low": float, "high": float})
 
 
-def save_fit(result: Fit, cloud: PointCloud, folder: str | Path, name: str | None = None) -> Path:
+def fit_tables(folder: Path) -> FolderTable:
+    """The table over all fits that lie in a folder."""
+    return FolderTable(folder, "traits.csv", "fit.json", COLUMNS)
+
+
+def save_fit(
+    result: Fit, cloud: PointCloud, folder: str | Path, name: str | None = None, *, meshes: Sequence[str] = ("ply",)
+) -> Path:
     """Write ``folder/name/``: fit.json, traits.csv, model.ply, fit.png and convergence.png; all of them or none.
 
-    A folder of that name from an earlier run is replaced.  model.ply is in the input's unit and frame.
+    A folder of that name from an earlier run is replaced; files in it that phytofit did not make are kept.  The model
+    is in the input's unit and frame; `meshes` says in which formats, of ply, obj and glb.
+
+    Raises NoPhytomerError where a trait is not a number, OutputError where the result can't be written.
     """
-    name = name or cloud.name
+    name = for_file_name(name or cloud.name)
+    _check_finite(result)
     with whole_folder(Path(folder), name, "fit.json") as part:
-        (part / "fit.json").write_text(json.dumps(_as_json(result, cloud, name), indent=1) + "\n", encoding="utf-8")
-        (part / "traits.csv").write_text(table_text(trait_table(name, result.traits)), encoding="utf-8", newline="")
-        model = mesh(result.organs)
-        model.vertices = cloud.to_input_frame(np.asarray(model.vertices))
-        model.export(part / "model.ply")
+        write_table(part / "traits.csv", trait_table(name, result.traits))
+        for kind in dict.fromkeys(("ply", *meshes)):
+            write_mesh(part / f"model.{kind}", result.organs, cloud)
         plot_fit(result, title=name).savefig(part / "fit.png", dpi=150, metadata={"Software": None})
         plot_convergence(result).savefig(part / "convergence.png", dpi=150, metadata={"Software": None})
+        said = _as_json(result, cloud, name) | {"files": files_made(part)}
+        (part / "fit.json").write_text(json_text(said), encoding="utf-8", newline="")
     return Path(folder) / name
+
+
+def _check_finite(result: Fit) -> None:
+    """NoPhytomerError where the fit is no phytomer of this world."""
+    ends = [(t.name, end) for t in result.traits for end in (t.value, t.low, t.high) if end is not None]
+    for what, value in (*ends, *result.parameters.items(), ("error", result.error)):
+        if not np.isfinite(value):
+            raise NoPhytomerError(f"its {what.replace('_', ' ')} came out as {value}, not as a number: see its points")
 
 
 def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:

@@ -1,8 +1,6 @@
 """What a reconstruction and a segmentation look like on disk: all of it, or nothing."""
 
 import json
-import shutil
-import tempfile
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -12,13 +10,29 @@ import numpy as np
 import pandas as pd
 
 from phytofit.cloud import read_cloud, write_cloud
-from phytofit.errors import InputError, OutputError
+from phytofit.errors import InputError
 from phytofit.plots import plot_reconstruction, plot_segmentation
 from phytofit.reconstruct import Reconstruction
-from phytofit.results.files import input_of, table_text, whole_folder
+from phytofit.results.files import files_made, input_of, json_text
+from phytofit.results.replacing import check_made, file_hash, made_in, whole_files, whole_folder
+from phytofit.results.tables import FolderTable, write_table
 from phytofit.segmentation import Segmentation, SegmentedLeaf
+from phytofit.text import for_file_name, one_line
 
-__all__ = ["leaf_table", "read_segmentation", "save_reconstruction", "save_segmentation"]
+__all__ = [
+    "check_reconstruction",
+    "leaf_table",
+    "leaf_tables",
+    "read_segmentation",
+    "save_reconstruction",
+    "save_segmentation",
+]
+
+LENGTHS = ("collar_distance", "collar_height", "length")
+LEAF_COLUMNS = [
+    *("cloud", "rank", "label", "azimuth_deg", "n_points", "flags"),
+    *(f"{name}_{unit}" for name in LENGTHS for unit in ("cm", "rel")),
+]
 
 
 def save_reconstruction(result: Reconstruction, folder: str | Path) -> Path:
@@ -31,31 +45,27 @@ def save_reconstruction(result: Reconstruction, folder: str | Path) -> Path:
         If they can't be written there; then nothing is.
     """
     folder = Path(folder)
-    part = None
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(prefix=".reconstruction.part-", dir=folder))
+    check_reconstruction(folder)
+    with whole_files(folder) as part:
         write_cloud(
             part / "plant.ply",
             result.cloud,
             {"view": result.view.astype(np.int32), "n_views": result.n_views.astype(np.int32)},
         )
-        text = json.dumps(_as_json(result), indent=1) + "\n"
-        (part / "reconstruction.json").write_text(text, encoding="utf-8", newline="")
         figure = plot_reconstruction(result, title=result.cloud.name)
         figure.savefig(part / "reconstruction.png", dpi=150, metadata={"Software": None})
-        for file in sorted(part.iterdir()):
-            file.replace(folder / file.name)
-    except OutputError:
-        raise
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: results can't be written there ({error.strerror}); name another folder with --out"
-        ) from None
-    finally:
-        if part is not None:
-            shutil.rmtree(part, ignore_errors=True)
+        said = _as_json(result) | {"files": files_made(part)}
+        (part / "reconstruction.json").write_text(json_text(said), encoding="utf-8", newline="")
     return folder
+
+
+def check_reconstruction(folder: str | Path) -> None:
+    """OutputError if there are files in the folder that a reconstruction would replace and phytofit did not make, or
+    that were changed since."""
+    folder = Path(folder)
+    made = made_in(folder)
+    for name in ("plant.ply", "reconstruction.png", "reconstruction.json"):
+        check_made(folder / name, lambda path: made.get(path.name) == file_hash(path))
 
 
 def _as_json(result: Reconstruction) -> dict[str, Any]:
@@ -65,7 +75,7 @@ def _as_json(result: Reconstruction) -> dict[str, Any]:
     n_seen = np.bincount(result.n_views, minlength=len(result.files) + 1)[1:]
     return {
         "phytofit": version("phytofit"),
-        "input": result.cloud.name,
+        "input": one_line(result.cloud.name),
         "camera": {
             "name": camera.name,
             **{key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height")},
@@ -114,16 +124,17 @@ def save_segmentation(result: Segmentation, folder: str | Path, name: str | None
 
     A folder of that name from an earlier run is replaced.  The clouds are in the input's unit and frame, with labels.
     """
-    name = name or result.cloud.name
+    name = for_file_name(name or result.cloud.name)
     with whole_folder(Path(folder), name, "segmentation.json") as part:
         write_cloud(part / "plant.ply", result.plant)
         (part / "phytomers").mkdir()
         for leaf, phytomer in zip(result.leaves, result.phytomers(), strict=True):
             write_cloud(part / "phytomers" / f"leaf_{leaf.rank:02d}.ply", phytomer)
-        (part / "leaves.csv").write_text(table_text(leaf_table(name, result)), encoding="utf-8", newline="")
-        (part / "segmentation.json").write_text(json.dumps(_segmented(result), indent=1) + "\n", encoding="utf-8")
+        write_table(part / "leaves.csv", leaf_table(name, result))
         picture = plot_segmentation(result, title=name)
         picture.savefig(part / "segmentation.png", dpi=150, metadata={"Software": None})
+        said = _segmented(result) | {"files": files_made(part)}
+        (part / "segmentation.json").write_text(json_text(said), encoding="utf-8", newline="")
     return Path(folder) / name
 
 
@@ -146,6 +157,11 @@ def leaf_table(name: str, result: Segmentation, *, plant: int = 1) -> pd.DataFra
         for leaf in result.leaves
     ]
     return pd.DataFrame(rows)
+
+
+def leaf_tables(folder: Path) -> FolderTable:
+    """The table over all segmentations that lie in a folder."""
+    return FolderTable(folder, "leaves.csv", "segmentation.json", LEAF_COLUMNS)
 
 
 def read_segmentation(folder: str | Path) -> Segmentation:
@@ -174,7 +190,7 @@ def _segmented(result: Segmentation) -> dict[str, Any]:
     """What segmentation.json holds: all but the points, which are in plant.ply."""
     return {
         "phytofit": version("phytofit"),
-        "cloud": result.cloud.name,
+        "cloud": one_line(result.cloud.name),
         "input": input_of(result.cloud),
         "unit": result.cloud.unit,
         "stem_path": result.stem_path.tolist(),
