@@ -37,7 +37,7 @@ LAYERS = [
     {"models"},
     {"cloud"},
     {"kernels"},
-    {"parameters", "parsing"},
+    {"ordering", "parameters", "parsing"},
     {"bundled", "errors", "text"},
 ]
 DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}

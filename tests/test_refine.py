@@ -314,3 +314,61 @@ def test_nothing_is_evaluated_twice_and_the_best_is_kept():
     errors = [problem.error(theta) for theta in asked]
     np.testing.assert_array_equal(asked[int(np.argmin(errors))], end.theta)
     assert end.error == min(errors)
+
+
+# what no step can be made of
+
+
+@pytest.mark.parametrize(
+    "information",
+    [
+        np.diag([1.0, -1.0]),
+        np.array([[1.0, 3.0], [3.0, 1.0]]),
+        np.array([[0.0, 1.0], [1.0, 0.0]]),
+        -np.eye(2),
+    ],
+)
+def test_an_indefinite_information_ends_and_is_not_called_converged(information):
+    """Of a bowl, so that steps that are damped enough go down: it never ends higher than it began."""
+    asked = []
+
+    def terms(x):
+        asked.append(x)
+        return float(x @ x), 2.0 * x, information
+
+    free = {"lower": np.full(2, -np.inf), "upper": np.full(2, np.inf)}
+    end = refine(terms, np.array([2.0, -1.0]), **free)
+    assert not end.converged
+    assert end.error <= 5.0
+    assert len(asked) <= 1500  # 100 iterations of 10 dampings at most, and some
+
+
+def test_an_indefinite_information_is_damped_until_steps_go_down():
+    free = {"lower": np.full(2, -np.inf), "upper": np.full(2, np.inf)}
+    indefinite = np.array([[1.0, 3.0], [3.0, 1.0]])
+    end = refine(lambda x: (float(x @ x), 2.0 * x, indefinite), np.array([2.0, -1.0]), **free)
+    assert end.error < 0.5
+
+
+@pytest.mark.parametrize("place", range(3))
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_terms_that_are_not_finite_end_it_where_it_is(place, value):
+    """From the start, or beyond it: what is returned is the last state of which everything was known."""
+
+    def terms(x):
+        known = [float(x @ x), 2.0 * x, np.diag([2.0, 2.0])]
+        if x[0] < beyond:
+            known[place] = np.full_like(known[place], value)
+        return known
+
+    free = {"lower": np.full(2, -np.inf), "upper": np.full(2, np.inf)}
+    beyond = 10.0
+    start = np.array([4.0, 1.0])
+    end = refine(terms, start, **free)
+    assert (end.iterations, end.converged) == (0, False)
+    np.testing.assert_array_equal(end.theta, start)
+    beyond = 1.0
+    end = refine(terms, start, **free)
+    assert not end.converged
+    assert np.isfinite(end.error)
+    assert 1.0 <= end.theta[0] < 4.0

@@ -39,7 +39,7 @@ class Status(Enum):
     CONVERGED = "converged: the mean of the last elite is as good as its members"
     SPLIT_ELITE = "did not converge: the last elite is spread over solutions whose mean is worse than they are"
     AT_REST = "converged: no small change makes the fit more probable"
-    MOVING = "did not converge: the refinement was stopped while the fit still became more probable"
+    MOVING = "did not converge: the refinement stopped before it came to rest"
 
     @property
     def good(self) -> bool:

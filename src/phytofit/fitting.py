@@ -105,20 +105,20 @@ def fit(
     CrossEntropy(species.space, **{name: value for name, value in used.items() if name in SEARCH})  # checks them
     if not stem_above:
         species = species.leading(N_PAPER)
-    found = prepare(
-        cloud,
-        species,
-        n_points=used["n_points"],
-        up=direction,
-        with_outliers=method == "likelihood",
-        seed_points=None if seed_points is None else cloud.from_input_frame(seed_points),
-    )
-    means = [mean_at(start, species.leading(N_SEARCHED).space) for start in found.starts]
-    if random_start:
-        drawn = CrossEntropy(species.leading(N_SEARCHED).space, n_samples=2, elite_fraction=0.9, seed=seed)
-        means[0] = drawn.ask()[0]  # from the prior, within its bounds (Fig. 7d)
     one_thread = threadpool_limits(limits=1, user_api="blas")  # more would round sums in another order
     with one_thread, ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
+        found = prepare(
+            cloud,
+            species,
+            n_points=used["n_points"],
+            up=direction,
+            with_outliers=method == "likelihood",
+            seed_points=None if seed_points is None else cloud.from_input_frame(seed_points),
+        )
+        means = [mean_at(start, species.leading(N_SEARCHED).space) for start in found.starts]
+        if random_start:
+            drawn = CrossEntropy(species.leading(N_SEARCHED).space, n_samples=2, elite_fraction=0.9, seed=seed)
+            means[0] = drawn.ask()[0]  # from the prior, within its bounds (Fig. 7d)
         result = METHODS[method](found, species, means, seed=seed, executor=executor, progress=progress, **search)
     pose = found.home @ result.pose
     pose[:3, 3] *= found.scale

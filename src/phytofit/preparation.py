@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from phytofit.cloud import PointCloud, remove_outliers, size_cm, thin
 from phytofit.meant import meant_points
+from phytofit.ordering import canonical_order
 from phytofit.pose import StartPose, start_poses
 from phytofit.species import Species
 
@@ -23,11 +24,11 @@ OTHERS_TOUCH = "other leaves touch this one, or its stem beside it: angle, width
 class Prepared:
     """A cloud ready to be fitted.
 
-    ``used`` is the cloud, without outliers unless they were to be kept, ``kept`` (m,) the indices of its points that
-    are left when it is thinned, ``points`` (m, 3) those as seen from the best start pose, upright, in the prior's cm,
-    ``organ`` (m,) what their labels say (0 stem, 1 leaf, -1 unknown) or None; ``starts`` the start poses in that
-    frame; ``home`` (4, 4) maps it to the cloud's, ``scale`` of whose lengths make a cm.  ``notes`` tell what was left
-    out, ``flags`` what that may have done to the rest.
+    ``used`` is the cloud in canonical order, without outliers unless they were to be kept, ``kept`` (m,) the indices of
+    its points that are left when it is thinned, ``points`` (m, 3) those as seen from the best start pose, upright, in
+    the prior's cm, ``organ`` (m,) what their labels say (0 stem, 1 leaf, -1 unknown) or None; ``starts`` the start
+    poses in that frame; ``home`` (4, 4) maps it to the cloud's, ``scale`` of whose lengths make a cm.  ``notes`` tell
+    what was left out, ``flags`` what that may have done to the rest.
     """
 
     used: PointCloud
@@ -54,10 +55,12 @@ def prepare(
 
     The stem is looked for without outliers; `with_outliers` keeps them for the fit, in case that it accounts for them,
     and then thins the cloud at random: one point a voxel would change how points are spread around a surface.
-    The coordinates are rounded, so that a rotated copy of the cloud gives the same numbers.
+    Points are put in one order before anything is drawn from them, and the coordinates are rounded, so that neither the
+    order of the rows nor a rotation of the cloud changes the numbers.
 
     seed_points : (k, 3) cm, on the leaf that is meant: beside the stem no other leaf's points count
     """
+    cloud = cloud.take(canonical_order(cloud.points, cloud.labels))
     looked_at = cloud.take(_some(len(cloud), N_LOOKED_AT)) if with_outliers else cloud
     clean = looked_at.take(remove_outliers(looked_at.points))
     used = cloud if with_outliers else clean
@@ -89,10 +92,8 @@ def prepare(
 
 
 def _some(n: int, n_wanted: int) -> NDArray[np.intp]:
-    """Indices of so many of n points, drawn without regard to where they are; in order."""
-    if n <= n_wanted:
-        return np.arange(n)
-    return np.sort(np.random.default_rng(n).permutation(n)[:n_wanted])
+    """Indices of so many of n points that are in canonical order, in which the first are a sample of all."""
+    return np.arange(min(n, n_wanted))
 
 
 def _rigid_inverse(pose: FloatArray) -> FloatArray:

@@ -38,41 +38,49 @@ def refine(
 
     Parameters
     ----------
-    evaluate : theta (k,) -> error, gradient (k,), information (k, k), positive semi-definite
+    evaluate : theta (k,) -> error, gradient (k,), information (k, k), positive semi-definite; where any of them is not
+        finite, no step is taken; where the information is indefinite, steps are damped until its curvature is positive,
+        and the end is not called converged
     tolerance : of the error, which the next step is expected to lower by less
     kink : where no step lowers an error that was expected to fall by less than this, it has a kink, and that is its
         minimum
     """
     theta = np.clip(theta, lower, upper)
-    error, gradient, information = evaluate(theta)
+    now = evaluate(theta)
+    if not _finite(now):
+        return Refined(theta, now[0], 0, False)
+    error, gradient, information = now
     missing = np.zeros_like(information)  # what the curvature has that the information lacks
     damping = 1e-3
     for iteration in range(1, max_iterations + 1):
         free = ~(((theta <= lower) & (gradient > 0.0)) | ((theta >= upper) & (gradient < 0.0)))
-        diagonal = np.diag(information)[free]
+        diagonal = np.abs(np.diag(information)[free])
         hoped = None  # by how much the error is expected to fall in a step that is not damped
+        least = NO_DAMPING  # with which the curvature is positive
         while True:
-            damped = (information + missing)[np.ix_(free, free)] + np.diag(
-                (damping if hoped is not None else NO_DAMPING) * diagonal + 1e-9
+            if max(damping, least) > MOST_DAMPING:
+                return Refined(theta, error, iteration, hoped is not None and least == NO_DAMPING and hoped < kink)
+            factor = _factor(
+                (information + missing)[np.ix_(free, free)]
+                + np.diag((max(damping, least) if hoped is not None else least) * diagonal + 1e-9)
             )
-            try:
-                factor = cho_factor(damped)
-            except LinAlgError:
-                missing[:] = 0.0
-                damping *= MORE
+            if factor is None:
+                if missing.any():
+                    missing[:] = 0.0
+                    damping *= MORE
+                else:  # the information itself is indefinite
+                    least *= MORE
                 continue
             step = np.zeros_like(theta)
             step[free] = -cho_solve(factor, gradient[free])
             if hoped is None:
                 hoped = -0.5 * float(gradient @ step)
-                if hoped < tolerance:
+                if hoped < tolerance and least == NO_DAMPING:
                     return Refined(theta, error, iteration, True)
                 continue
-            if damping > MOST_DAMPING:
-                return Refined(theta, error, iteration, hoped < kink)
             tried = np.clip(theta + step, lower, upper)
             now = evaluate(tried)
-            if now[0] < error:
+            if now[0] < error and _finite(now):
                 damping = max(LESS * damping, LEAST_DAMPING)
                 break
             damping *= MORE
@@ -82,6 +90,19 @@ def refine(
         error, gradient, information = now
         missing = _update(information + missing, moved, gradient - before) - information
     return Refined(theta, error, max_iterations, False)
+
+
+def _finite(terms: tuple[float, FloatArray, FloatArray]) -> bool:
+    return all(bool(np.isfinite(term).all()) for term in terms)
+
+
+def _factor(curvature: FloatArray) -> tuple[FloatArray, bool] | None:
+    """Cholesky's factor of a curvature (k, k), None where it is not positive."""
+    try:
+        factor: tuple[FloatArray, bool] = cho_factor(curvature, check_finite=False)
+    except LinAlgError:
+        return None
+    return factor
 
 
 def _update(curvature: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 
 from phytofit.cloud import PointCloud
 from phytofit.errors import CloudError, NoStemError, SettingError
+from phytofit.ordering import canonical_order
 from phytofit.parsing import parse_up
 from phytofit.segmentation.derive import SegmentedLeaf, derive_leaves
 from phytofit.segmentation.graph import PlantGraph, coarse, geodesics, plant_graph
@@ -122,11 +123,21 @@ def segment(
     SettingError
         If `up` or `n_nodes` can't be used.
     """
-    direction = stated = parse_up(up)
+    direction = parse_up(up)
     if n_nodes < LEAST_SETTING:
         raise SettingError(f"segment: expected n_nodes >= {LEAST_SETTING}, got {n_nodes}")
     if len(cloud) < MIN_POINTS:
         raise CloudError(f"{cloud.name}: found {len(cloud)} points, at least {MIN_POINTS} are needed to see a plant")
+    order = canonical_order(cloud.points, cloud.labels)
+    found = _segmented(cloud.take(order), direction, n_nodes, labelled=labelled)
+    labels = np.empty_like(found.labels)
+    labels[order] = found.labels
+    return replace(found, cloud=cloud, labels=labels)
+
+
+def _segmented(cloud: PointCloud, direction: FloatArray | None, n_nodes: int, *, labelled: bool) -> Segmentation:
+    """What :func:`segment` returns, of a cloud whose points are in canonical order."""
+    stated = direction
     first, stands_for = coarse(cloud.points)
     points = cloud.points[first]
     notes: list[str] = []
