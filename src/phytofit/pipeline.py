@@ -1,8 +1,6 @@
 """From the images or the cloud of a plant to the traits of all its leaves: reconstruct, segment, fit."""
 
-import hashlib
 import json
-import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,23 +12,35 @@ import numpy as np
 import pandas as pd
 
 from phytofit.cloud import PointCloud, read_cloud
-from phytofit.errors import CloudError, InputError, NoPhytomerError
+from phytofit.errors import CloudError, InputError, NoPhytomerError, OutputError, PhytofitError
 from phytofit.fitting import fit
 from phytofit.plots import plot_plant
 from phytofit.reconstruct import depth_files, reconstruct
 from phytofit.results import (
+    COLUMNS,
+    LOG,
+    OURS,
+    check_made,
+    check_reconstruction,
+    check_table,
+    delete_made,
+    file_hash,
+    is_our_picture,
     prepare_folder,
     read_segmentation,
+    read_table,
     save_fit,
     save_reconstruction,
     save_segmentation,
-    table_text,
     trait_table,
     whole_file,
+    whole_folder,
+    write_table,
     write_text,
 )
 from phytofit.segmentation import Segmentation, SegmentedLeaf, segment
 from phytofit.species import Species, load_species
+from phytofit.text import one_line
 from phytofit.traits import Trait
 
 __all__ = ["PlantRun", "plant_traits", "run"]
@@ -91,7 +101,8 @@ def run(
     source, folder = Path(source), Path(folder)
     if source.is_dir() and source.resolve() == folder.resolve():
         raise InputError(f"{folder}: the folder of the images can't hold the results; name another with --out")
-    folder, name = prepare_folder(folder), source.resolve().stem if source.is_file() else source.resolve().name
+    name = source.resolve().stem if source.is_file() else source.resolve().name
+    _prepare(folder)
     species = species if isinstance(species, Species) else load_species(species)
     log = _Log([], [], [], progress)
     cloud_file = source
@@ -108,14 +119,28 @@ def run(
         progress("fit", i, len(found.leaves))
         tables.append(_fitted(found, leaf, phytomer, folder, species, {"seed": seed, "threads": threads}, log))
     progress("fit", len(found.leaves), len(found.leaves))
-    for old in sorted((folder / "leaves").glob("leaf_*"))[len(found.leaves) :]:
-        shutil.rmtree(old)  # of an earlier run that saw more leaves
     whole = pd.concat(tables, ignore_index=True)
-    write_text(folder / "traits.csv", table_text(whole))
+    write_table(folder / "traits.csv", whole)
+    for old in sorted((folder / "leaves").glob("leaf_*"))[len(found.leaves) :]:
+        delete_made(old)  # of an earlier run that saw more leaves
     picture = plot_plant(found, whole, title=name)
     with whole_file(folder / "plant.png") as part:
-        picture.savefig(part, dpi=150, format="png", metadata={"Software": None})
+        picture.savefig(part, dpi=150, format="png", metadata=OURS)
     return PlantRun(whole, found, tuple(log.flags), tuple(log.notes), tuple(log.skipped))
+
+
+def _prepare(folder: Path) -> None:
+    """Repair what an earlier run left in the folder of a plant; OutputError if it can't hold one."""
+    prepare_folder(folder)
+    for place in (folder / "reconstruction", folder / "segmentation", folder / "leaves"):
+        if place.is_dir():
+            prepare_folder(place)
+    for leaf in (folder / "leaves").glob("leaf_*"):
+        prepare_folder(leaf)
+    check_table(folder / "traits.csv", COLUMNS)
+    check_made(folder / "plant.png", is_our_picture)
+    if any(folder.glob("*/fit.json")):
+        raise OutputError(f"{folder}: it holds results of single leaves; choose another folder for a whole plant")
 
 
 @dataclass(frozen=True)
@@ -139,7 +164,7 @@ def _reconstructed(source: Path, folder: Path, how: Mapping[str, Any], log: _Log
     if _up_to_date(target, key):
         log.skipped.append("reconstruct")
     else:
-        (target / KEY).unlink(missing_ok=True)
+        check_reconstruction(target)
         save_reconstruction(reconstruct(source, **how), target)
         _done(target, key, ("plant.ply", "reconstruction.json"))
     said = json.loads((target / "reconstruction.json").read_text(encoding="utf-8"))
@@ -183,14 +208,12 @@ def _fitted(
 ) -> pd.DataFrame:
     """The traits of one leaf, by its fit; where that is refused, its length along its points."""
     name = f"leaf_{leaf.rank:02d}"
-    target = prepare_folder(folder / "leaves") / name
+    target = folder / "leaves" / name
     segmented = [folder / "segmentation" / file for file in ("plant.ply", "segmentation.json")]
     key = _key(name, segmented, {"species": repr(species), "seed": how["seed"]})
     if _up_to_date(target, key):
         log.skipped.append(name)
     else:
-        if (target / KEY).is_file() and not (target / "fit.json").exists():
-            shutil.rmtree(target)  # of an earlier run, that could not fit it
         try:
             fitted = fit(phytomer, species=species, up=found.up, **how)
             assert fitted.estimate is not None
@@ -198,15 +221,26 @@ def _fitted(
             if outliers > MOST_OUTLIERS:
                 raise NoPhytomerError(f"the model does not explain {100 * outliers:.0f} % of the points")
             save_fit(fitted, phytomer, folder / "leaves", name)
+            _done(target, key, ("traits.csv",))
         except (NoPhytomerError, CloudError) as error:
-            shutil.rmtree(target, ignore_errors=True)  # of an earlier run, that could fit it
-            by_points = trait_table(found.cloud.name, [_by_its_points(found, leaf, str(error))])
-            write_text(prepare_folder(target) / "traits.csv", table_text(by_points))
-        _done(target, key, ("traits.csv",))
-    table = pd.read_csv(target / "traits.csv")
+            _save_by_points(found, leaf, str(error), target, key)
+        except PhytofitError:
+            raise
+        except Exception as error:  # whatever it is, the other leaves go on
+            LOG.exception("%s: a fault of phytofit", name)
+            reason = f"a fault of phytofit, {type(error).__name__}: {one_line(error)}"
+            _save_by_points(found, leaf, reason, target, _key(name, [], {"fault": reason}))  # to be tried again
+    table = read_table(target / "traits.csv")
     flags = "; ".join(table["flags"].dropna()).split("; ")
     log.flags.extend(f"leaf {leaf.rank}: {flag}" for flag in dict.fromkeys(flags) if flag)
     return _of_leaf(table, found.cloud.name, leaf.rank)
+
+
+def _save_by_points(found: Segmentation, leaf: SegmentedLeaf, reason: str, target: Path, key: str) -> None:
+    """In place of a fit, the length of a leaf along its points."""
+    with whole_folder(target.parent, target.name, KEY, "fit.json") as part:
+        write_table(part / "traits.csv", trait_table(found.cloud.name, [_by_its_points(found, leaf, reason)]))
+        _done(part, key, ("traits.csv",))
 
 
 def plant_traits(found: Segmentation) -> list[Trait]:
@@ -261,20 +295,20 @@ def _of_leaf(table: pd.DataFrame, name: str, rank: int) -> pd.DataFrame:
 
 def _key(stage: str, files: Sequence[Path], settings: Mapping[str, Any]) -> str:
     """What a stage's result follows from: version, input files by their content, settings."""
-    inputs = {path.name: _hash(path) for path in files}
+    inputs = {path.name: file_hash(path) for path in files}
     return json.dumps({"phytofit": version("phytofit"), "stage": stage, "inputs": inputs, "settings": dict(settings)})
 
 
 def _up_to_date(folder: Path, key: str) -> bool:
     """Whether the folder holds what a stage with this key made, unchanged."""
     made = _made(folder, key)
-    return made is not None and all(_hash(folder / name) == was for name, was in made.items())
+    return made is not None and all(file_hash(folder / name) == was for name, was in made.items())
 
 
 def _same_but_edited(folder: Path, key: str, name: str) -> bool:
     """Whether of what a stage with this key made this file was changed, not deleted."""
     made = _made(folder, key)
-    return made is not None and _hash(folder / name) not in (None, made[name])
+    return made is not None and file_hash(folder / name) not in (None, made[name])
 
 
 def _made(folder: Path, key: str) -> dict[str, str] | None:
@@ -289,13 +323,5 @@ def _made(folder: Path, key: str) -> dict[str, str] | None:
 
 def _done(folder: Path, key: str, made: Sequence[str]) -> None:
     """Said last, so that a stage that was stopped before is done again."""
-    said = json.loads(key) | {"made": {name: _hash(folder / name) for name in made}}
+    said = json.loads(key) | {"made": {name: file_hash(folder / name) for name in made}}
     write_text(folder / KEY, json.dumps(said, indent=1) + "\n")
-
-
-def _hash(path: Path) -> str | None:
-    """SHA-256 of a file; None if it can't be read."""
-    try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    except OSError:
-        return None

@@ -1,6 +1,6 @@
 """What results look like on disk: nothing half-written, nothing lost."""
 
-from phytofit.results.files import files_made, json_text, result_names, write_text
+from phytofit.results.files import OURS, files_made, is_our_picture, json_text, result_names, write_text
 from phytofit.results.log import LOG, open_log
 from phytofit.results.models import MESHES, check_meshes, write_mesh
 from phytofit.results.phytomer import COLUMNS, fit_tables, save_fit, trait_table
@@ -37,6 +37,7 @@ __all__ = [
     "COLUMNS",
     "LOG",
     "MESHES",
+    "OURS",
     "FolderTable",
     "check_made",
     "check_meshes",
@@ -47,6 +48,7 @@ __all__ = [
     "file_hash",
     "files_made",
     "fit_tables",
+    "is_our_picture",
     "json_text",
     "leaf_table",
     "leaf_tables",

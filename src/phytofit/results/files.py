@@ -16,8 +16,9 @@ from phytofit.errors import CloudError
 from phytofit.results.replacing import file_hash, whole_file
 from phytofit.text import for_file_name, one_line
 
-__all__ = ["files_made", "input_of", "json_text", "result_names", "write_text"]
+__all__ = ["OURS", "files_made", "input_of", "is_our_picture", "json_text", "result_names", "write_text"]
 
+OURS = {"Software": "phytofit"}  # what a picture says, beside which no record stands
 RESERVED = (  # what commands write beside the folders of results
     *("traits.csv", "traits.xlsx", "leaves.csv", "leaves.xlsx", "failed.csv", "phytofit.log", "truth.csv", "plant.png"),
     *("reconstruction", "segmentation", "leaves"),
@@ -70,6 +71,12 @@ def files_made(folder: Path) -> dict[str, str | None]:
     """SHA-256 of each file in a folder, by its path there: what a result's record says of the others."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {path.relative_to(folder).as_posix(): file_hash(path) for path in files}
+
+
+def is_our_picture(path: Path) -> bool:
+    """Whether a PNG says that phytofit made it."""
+    with path.open("rb") as file:
+        return b"Software\0phytofit" in file.read(1000)
 
 
 def json_text(said: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from phytofit.cloud import PointCloud
-from phytofit.errors import NoPhytomerError
+from phytofit.errors import NoPhytomerError, OutputError
 from phytofit.fitted import Fit
 from phytofit.plots import plot_convergence, plot_fit
 from phytofit.recipe import recipe_of
@@ -38,7 +38,9 @@ def trait_table(name: str, traits: Iterable[Trait], *, plant: int = 1) -> pd.Dat
 
 
 def fit_tables(folder: Path) -> FolderTable:
-    """The table over all fits that lie in a folder."""
+    """The table over all fits that lie in a folder; OutputError if it is that of a whole plant."""
+    if (folder / "segmentation" / "stage.json").is_file():
+        raise OutputError(f"{folder}: it holds the result of a whole plant; choose another folder for those of leaves")
     return FolderTable(folder, "traits.csv", "fit.json", COLUMNS)
 
 
@@ -54,7 +56,7 @@ def save_fit(
     """
     name = for_file_name(name or cloud.name)
     _check_finite(result)
-    with whole_folder(Path(folder), name, "fit.json") as part:
+    with whole_folder(Path(folder), name, "fit.json", "stage.json") as part:
         write_table(part / "traits.csv", trait_table(name, result.traits))
         for kind in dict.fromkeys(("ply", *meshes)):
             write_mesh(part / f"model.{kind}", result.organs, cloud)

@@ -97,21 +97,21 @@ def whole_files(folder: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(folder: Path, name: str, mark: str) -> Iterator[Path]:
+def whole_folder(folder: Path, name: str, *marks: str) -> Iterator[Path]:
     """A hidden folder to write into; when all is written it becomes ``folder/name``, in the place of an older one.
 
     Of that, what phytofit did not make, or what was changed since, is kept: under its own name, or as ``NAME.yours``
     where the new result has a file of that name.  A link is followed.
 
-    Raises OutputError where there is a folder of that name without the file `mark`, which is no result of ours.
+    Raises OutputError where there is a folder of that name with none of the files `marks`: no result of this kind.
     """
     target = folder / name
     with _said(target, "the result can't be written", ROOM):
         target = target.resolve() if target.is_symlink() else target
-        if os.path.lexists(target) and not (target / mark).is_file() and not _is_empty(target):
+        if os.path.lexists(target) and not _is_empty(target) and not any((target / it).is_file() for it in marks):
             raise OutputError(
-                f"{target}: it is there already, and holds no {mark} of an earlier run; choose another folder, or move "
-                "it away"
+                f"{target}: it is there already, and holds no {marks[0]} of an earlier run; choose another folder, or "
+                "move it away"
             )
         prepare_folder(target.parent)
         with _installed(target.parent) as part:
@@ -121,15 +121,16 @@ def whole_folder(folder: Path, name: str, mark: str) -> Iterator[Path]:
                 _keep(target, part / target.name)
 
 
-def made_in(folder: Path) -> dict[str, str | None]:
-    """SHA-256 of each file that phytofit made in a result's folder, by its path there, as the result's records say;
-    of the records themselves, too."""
-    made: dict[str, str | None] = {}
+def made_in(folder: Path) -> set[tuple[str, str | None]]:
+    """Path in a result's folder, and SHA-256, of each file that phytofit made there, as the result's records say; of
+    the records themselves, too."""
+    made: set[tuple[str, str | None]] = set()
     for record in RECORDS:
         with contextlib.suppress(OSError, ValueError, TypeError, AttributeError):
             said = json.loads((folder / record).read_text(encoding="utf-8"))
             if "phytofit" in said:
-                made |= {**said.get("files", {}), **said.get("made", {}), record: file_hash(folder / record)}
+                made |= {*said.get("files", {}).items(), *said.get("made", {}).items()}
+                made.add((record, file_hash(folder / record)))
     return made
 
 
@@ -145,7 +146,7 @@ def check_made(path: Path, is_ours: Callable[[Path], bool]) -> None:
 def delete_made(folder: Path) -> None:
     """Delete what phytofit made of a result, and its folder if nothing else is in it; OutputError if that fails."""
     with _said(folder, "can't be deleted", "delete it"):
-        for name, known in made_in(folder).items():
+        for name, known in made_in(folder):
             if (folder / name).is_file() and file_hash(folder / name) == known:
                 (folder / name).unlink()
         for path in sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True):
@@ -183,8 +184,10 @@ def _keep(old: Path, new: Path) -> None:
     made = made_in(old)
     for path in sorted(old.rglob("*")):
         inside = path.relative_to(old)
+        if path.name.startswith(".phytofit-"):
+            continue
         if path.is_symlink() or not path.is_dir():
-            if inside.as_posix() in made and made[inside.as_posix()] == file_hash(path):
+            if (inside.as_posix(), file_hash(path)) in made:
                 continue
             to = _free(new / inside)
             to.parent.mkdir(parents=True, exist_ok=True)
