@@ -1,5 +1,8 @@
 """Agreement with hand measures: statistics against closed forms and SciPy, tables as people write them."""
 
+import unicodedata
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,6 +15,7 @@ from phytofit.cli import app
 from phytofit.errors import InputError
 from phytofit.validation import agreement, compare, concordance, read_measures, read_results
 
+AWKWARD = Path(__file__).parents[1] / "../shared/data/awkward"
 LEAVES = ((1, 20.0), (2, 30.0), (3, 40.0))  # ranks, and lengths in cm
 RESULT = "cloud,plant,organ,rank,trait,value,unit,low,high,method,flags\n"
 ROUNDING = 1e-9
@@ -33,55 +37,6 @@ def results_of(rows):
 def measures_of(rows):
     table = pd.DataFrame(rows, columns=["cloud", "trait", "value"])
     return table.assign(unit=["deg" if "angle" in t else "cm" for t in table["trait"]])
-
-
-@pytest.mark.parametrize(
-    ("header", "row", "value"),
-    [
-        ("cloud,leaf_length_cm", "a,51.5", 51.5),
-        ("Plant;Leaf length (mm)", "a;515", 51.5),
-        ("ID\tLength [m]", "a\t0.515", 51.5),
-        ('name,"Blade length, cm"', 'a,"51,5"', 51.5),
-        ("\ufeffcloud,Leaf Length_CM,remarks", "a,51.5,bent", 51.5),
-    ],
-)
-def test_columns_as_people_name_them(tmp_path, header, row, value):
-    table = read_measures(written(tmp_path, f"{header}\n{row}\n"))
-    assert table.to_dict("records") == [
-        {"cloud": "a", "rank": "", "trait": "leaf_length", "value": pytest.approx(value), "unit": "cm"}
-    ]
-
-
-def test_every_trait_has_a_column(tmp_path):
-    header = "cloud,stem diam mm,leaf_angle,leaf_width_cm,leaf insertion angle (rad),leaf area (mm2),stem_length_cm"
-    table = read_measures(written(tmp_path, f"{header}\n1,32,68,6.3,1,12000,\n"))
-    found = {row.trait: (row.value, row.unit) for row in table.itertuples()}
-    assert found == {
-        "stem_diameter": (pytest.approx(3.2), "cm"),
-        "leaf_angle": (68.0, "deg"),
-        "leaf_width": (6.3, "cm"),
-        "leaf_insertion_angle": (pytest.approx(57.29578), "deg"),
-        "leaf_area": (pytest.approx(120.0), "cm²"),
-    }  # an empty cell is no measure
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "CSV"),
-        ("cloud,leaf_length_cm\n", "no rows"),
-        ("leaf_length_cm\n5\n", "names the cloud"),
-        ("cloud,weight\na,3\n", "expected columns such as"),
-        ("cloud,leaf_length\na,3\n", "has no unit"),
-        ("cloud,leaf_length_cm\na,long\n", "expected a number, got 'long'"),
-        ("cloud,trait,value,unit\na,leaf_length,3,furlong\n", "expected a unit"),
-    ],
-)
-def test_what_is_no_table_of_measures_is_said(tmp_path, text, said):
-    path = written(tmp_path, text)
-    with pytest.raises(InputError, match=said) as caught:
-        read_measures(path)
-    assert str(path) in str(caught.value)
 
 
 def test_the_truth_of_simulated_phytomers_is_read(tmp_path):
@@ -193,12 +148,102 @@ def test_the_command_says_what_is_wrong(tmp_path, results, said):
     assert not (tmp_path / "v").exists()
 
 
-def test_leaves_of_a_plant_are_told_apart_by_their_rank(tmp_path):
+def measured(tmp_path, text, results):
+    return compare(read_measures(written(tmp_path, text)), results)
+
+
+def test_leaves_of_a_plant_are_found_by_their_rank(tmp_path):
     results = pd.concat([results_of([("p", "leaf_length", v, v - 1.0, v + 1.0)]).assign(rank=i) for i, v in LEAVES])
     text = "plant,rank,leaf_length_cm\np,1,20.5\np,3,39.0\np,4,50\n"
-    comparison = compare(read_measures(written(tmp_path, text)), results)
+    comparison = measured(tmp_path, text, results)
     assert comparison.pairs["value"].tolist() == [20.0, 40.0]
     assert comparison.pairs["cloud"].tolist() == ["p leaf 1", "p leaf 3"]
     assert "measured, no result: p leaf 4, leaf_length" in comparison.unmatched
     with pytest.raises(InputError, match="of 3 leaves; expected a column rank"):
-        compare(read_measures(written(tmp_path, "plant,leaf_length_cm\np,20\n")), results)
+        measured(tmp_path, "plant,leaf_length_cm\np,20\n", results)
+
+
+def test_a_trait_of_the_stem_is_found_beside_any_leaf(tmp_path):
+    results = results_of([("p", "stem_diameter", 3.0, 2.0, 4.0), ("p", "leaf_length", 30.0, 29.0, 31.0)])
+    results["rank"] = [0, 1]
+    pairs = measured(tmp_path, "plant,leaf,leaf_length_cm,stem_diameter_cm\np,1,31,3.5\n", results).pairs
+    assert pairs["cloud"].tolist() == ["p leaf 1", "p"]
+    assert pairs["measured"].tolist() == [31.0, 3.5]
+
+
+def test_plants_of_a_cloud_are_found_by_their_number(tmp_path):
+    results = pd.concat([results_of([("s", "leaf_length", v, np.nan, np.nan)]).assign(plant=i) for i, v in LEAVES])
+    pairs = measured(tmp_path, "cloud,plant,leaf_length_cm\ns,3,41\ns,1,21\n", results).pairs
+    assert pairs["cloud"].tolist() == ["s plant 3", "s plant 1"]
+    assert pairs["value"].tolist() == [40.0, 20.0]
+    with pytest.raises(InputError, match="of 3 plants; expected a column plant"):
+        measured(tmp_path, "cloud,leaf_length_cm\ns,20\n", results)
+    old = results[results["plant"] == 1].drop(columns="plant")  # a table of an earlier version
+    assert measured(tmp_path, "cloud,plant,leaf_length_cm\ns,1,21\n", old).pairs["value"].tolist() == [20.0]
+
+
+def test_a_result_given_twice_is_refused(tmp_path):
+    results = results_of([("p", "leaf_length", 30.0, 29.0, 31.0)] * 2)
+    with pytest.raises(InputError, match="leaf_length in 2 rows"):
+        measured(tmp_path, "plant,leaf_length_cm\np,20\n", results)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "cloud,leaf_length_cm\na,48\na,50\nb,72\n",
+        "cloud,leaf_length_cm,leaf length 2 (mm)\na,48,500\nb,72,NA\n",
+        "cloud,observer,leaf_length_cm\na,1,48\nb,1,72\nA.ply,2,50\n",
+    ],
+)
+def test_measures_of_several_observers_are_averaged_and_said(tmp_path, text):
+    results = results_of([("a", "leaf_length", 47.0, 46.0, 48.0), ("b", "leaf_length", 70.0, 69.0, 71.0)])
+    comparison = measured(tmp_path, text, results)
+    assert comparison.pairs["measured"].tolist() == [49.0, 72.0]
+    assert comparison.pairs["n_measured"].tolist() == [2, 1]
+    assert agreement(comparison.pairs)[0].n == 2
+    assert comparison.notes == ("leaf_length was measured more than once, and the mean is used: a (48, 50 cm)",)
+
+
+def test_how_far_many_repeats_differ_is_said(tmp_path):
+    """Of two normal values each: the standard deviation of one, pooled, is that of their differences over root two."""
+    random = np.random.default_rng(0)
+    first, second = random.normal(50.0, 2.0, (2, 8)).round(2)
+    results = results_of([(f"c{i}", "leaf_length", 50.0, 49.0, 51.0) for i in range(8)])
+    rows = "".join(f"c{i},{a},{b}\n" for i, (a, b) in enumerate(zip(first, second, strict=True)))
+    (note,) = measured(tmp_path, "cloud,length (cm) A,length (cm) B\n" + rows, results).notes
+    assert "in 8 of 8" in note
+    assert f"{np.sqrt(np.mean((first - second) ** 2) / 2.0):.2g} cm" in note
+    assert f"c{np.argmax(np.abs(first - second))} (" in note
+
+
+@pytest.mark.parametrize(
+    ("hand", "result"),
+    [
+        (unicodedata.normalize("NFD", "Prüfglied_3"), unicodedata.normalize("NFC", "Prüfglied_3")),
+        (unicodedata.normalize("NFC", "Prüfglied_3"), unicodedata.normalize("NFD", "Prüfglied_3")),
+        ("=1+1", "'=1+1"),
+        ("'-14", "'-14"),
+        ("scans/0003.ply", "0003"),
+        ("C:\\scans\\Leaf B.LAZ", "leaf_b"),
+        ("a/x.ply", "a_x"),
+        ("plant 7", "Plant_007"),
+    ],
+)
+def test_a_cloud_is_found_by_a_name_that_is_written_otherwise(hand, result):
+    results = results_of([(result, "leaf_length", 50.0, 49.0, 51.0), ("other", "leaf_length", 1.0, 0.0, 2.0)])
+    assert compare(measures_of([(hand, "leaf_length", 52.0)]), results).pairs["cloud"].tolist() == [result]
+
+
+@pytest.mark.skipif(not AWKWARD.is_dir(), reason="no data")
+def test_a_decomposed_name_is_one_plant():
+    folder = AWKWARD / "24_truth_nfd_name"
+    pairs = compare(read_measures(folder / "truth.csv"), read_results(folder / "traits.csv")).pairs
+    assert len(pairs) == 4
+    assert {unicodedata.normalize("NFC", name) for name in pairs["cloud"]} == {"Prüfglied_3", "0007"}
+    for name in ("truth", "truth_three_observers"):
+        measures = read_measures(AWKWARD / f"26_truth_duplicated_id/{name}.csv")
+        results = results_of([("0003", "leaf_length", 47.5, 47.0, 48.0), ("0007", "leaf_length", 72.0, 71.0, 73.0)])
+        found = compare(measures, results)
+        assert len(found.pairs) == 2
+        assert len(found.notes) == 1

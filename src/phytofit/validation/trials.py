@@ -64,10 +64,12 @@ def trial(
         else:
             for truth, found in zip(measure(made.organs), result.traits, strict=True):
                 flags = "; ".join(found.flags)
-                pairs.append((name, found.name, found.unit, truth.value, found.value, found.low, found.high, flags))
+                pairs.append((name, found.name, found.unit, truth.value, found.value, found.low, found.high, flags, 1))
         if progress is not None:
             progress()
-    table = pd.DataFrame(pairs, columns=PAIR_COLUMNS).astype(dict.fromkeys(PAIR_COLUMNS[3:7], float))
+    table = pd.DataFrame(pairs, columns=PAIR_COLUMNS).astype(
+        {**dict.fromkeys(PAIR_COLUMNS[3:7], float), "n_measured": int}
+    )
     return Trial(Comparison(table, tuple(refused)), number, dict(sensor))
 
 
