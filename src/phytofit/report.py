@@ -1,7 +1,6 @@
 """Reports that a browser shows without anything else: one HTML file, pictures inside."""
 
 import base64
-import html
 import io
 import math
 from collections.abc import Sequence
@@ -10,10 +9,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from phytofit.plots import plot_agreement, plot_trials
+from phytofit.text import for_page
 from phytofit.validation import Agreement, Comparison, agreement
 from phytofit.validation.trials import Trial
 
-__all__ = ["agreement_page", "agreement_table", "trial_page"]
+__all__ = ["GENERATOR", "agreement_page", "agreement_table", "trial_page"]
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
@@ -24,6 +24,7 @@ th:first-child, td:first-child { text-align: left; }
 img { max-width: 100%; } .note { color: #555; }
 @media print { body { max-width: none; } }
 """
+GENERATOR = '<meta name="generator" content="phytofit">'  # says whose page it is
 HEADINGS = ("n", "bias", "RMSE", "MAE", "R", "CCC", "limits of agreement", "covered", "flagged", "outliers")
 MEANING = (
     "Differences are result minus {measure}. Bias is their mean; RMSE and MAE are their root mean square and mean "
@@ -62,7 +63,7 @@ def trial_page(
     base: Trial, table: pd.DataFrame, answers: Sequence[str], percent: float, degrees: float, title: str
 ) -> str:
     """One self-contained HTML page: what points and views are needed, and the statistics with the sensor as it is."""
-    parts = ["<ul>", *(f"<li>{html.escape(text)}</li>" for text in answers), "</ul>"]
+    parts = ["<ul>", *(f"<li>{for_page(text)}</li>" for text in answers), "</ul>"]
     parts += [_image(plot_trials(table, percent, degrees), "errors by number of points and of views")]
     shown = table.assign(within=(100.0 * table["within"]).round(), coverage=(100.0 * table["coverage"]).round())
     shown = shown.rename(columns={"within": "within, %", "coverage": "covered, %", "rmse": "RMSE"})
@@ -75,22 +76,22 @@ def trial_page(
 def _agreement_parts(
     comparison: Comparison, found: Sequence[Agreement], against: str, measure: str, alone: str
 ) -> list[str]:
-    parts = [_table(agreement_table(found)), f'<p class="note">{html.escape(MEANING.format(measure=measure))}</p>']
+    parts = [_table(agreement_table(found)), f'<p class="note">{for_page(MEANING.format(measure=measure))}</p>']
     for a in found:
         those = comparison.pairs[comparison.pairs["trait"] == a.trait]
         picture = _image(plot_agreement(those, a, against), a.trait)
-        parts += [f"<h2>{html.escape(a.trait.replace('_', ' '))}</h2>", picture]
+        parts += [f"<h2>{for_page(a.trait.replace('_', ' '))}</h2>", picture]
     if comparison.unmatched:
         parts.append(f"<h2>{alone}</h2><ul>")
-        parts += [f"<li>{html.escape(text)}</li>" for text in comparison.unmatched]
+        parts += [f"<li>{for_page(text)}</li>" for text in comparison.unmatched]
         parts.append("</ul>")
     return parts
 
 
 def _page(title: str, parts: Sequence[str]) -> str:
-    body = "\n".join([f"<h1>{html.escape(title)}</h1>", *parts])
+    body = "\n".join([f"<h1>{for_page(title)}</h1>", *parts])
     return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title>'
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">{GENERATOR}<title>{for_page(title)}</title>'
         f"<style>{STYLE}</style></head>\n<body>\n{body}\n</body></html>\n"
     )
 
@@ -104,9 +105,9 @@ def _number(value: float) -> str:
 
 
 def _table(table: pd.DataFrame) -> str:
-    head = "".join(f"<th>{html.escape(text)}</th>" for text in (table.index.name or "trait", *table.columns))
+    head = "".join(f"<th>{for_page(text)}</th>" for text in (table.index.name or "trait", *table.columns))
     rows = "".join(
-        "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in (name, *row)) + "</tr>"
+        "<tr>" + "".join(f"<td>{for_page(str(cell))}</td>" for cell in (name, *row)) + "</tr>"
         for name, row in zip(table.index, table.to_numpy(), strict=True)
     )
     return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
@@ -116,4 +117,4 @@ def _image(figure: Figure, text: str) -> str:
     with io.BytesIO() as file:
         figure.savefig(file, format="png", dpi=110, metadata={"Software": None})
         data = base64.b64encode(file.getvalue()).decode()
-    return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
+    return f'<img alt="{for_page(text)}" src="data:image/png;base64,{data}">'

@@ -5,11 +5,12 @@ what stands between dollar signs as mathematics, a spreadsheet runs a cell that 
 outside passes the one function for where it goes.
 """
 
+import html
 import re
 
 from rich.markup import escape
 
-__all__ = ["for_file_name", "for_picture", "for_table", "for_terminal", "from_table", "one_line"]
+__all__ = ["for_file_name", "for_page", "for_picture", "for_table", "for_terminal", "from_table", "one_line"]
 
 FORMULA_STARTS = ("=", "+", "-", "@")  # with which a spreadsheet takes a cell for a formula (OWASP, CSV injection)
 MOST_NAME_BYTES = 200  # of a file name: most file systems take 255, and parts of files add to it
@@ -31,6 +32,11 @@ def for_terminal(text: object) -> str:
 def for_picture(text: object) -> str:
     """The text in one line, without mathematics that matplotlib would set."""
     return one_line(text).replace("$", r"\$")
+
+
+def for_page(text: object) -> str:
+    """The text in one line, without markup of a web page."""
+    return html.escape(one_line(text))
 
 
 def for_table(text: object) -> str:

@@ -9,7 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from phytofit.cli.console import app, complain, err, or_exit, out
+from phytofit.cli.console import app, complain, err, note, or_exit, out, tell
 from phytofit.cli.options import (
     NoiseOption,
     NoiseReachOption,
@@ -23,6 +23,7 @@ from phytofit.cli.options import (
     ViewsOption,
 )
 from phytofit.cli.settings import defaults_of
+from phytofit.text import for_terminal
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -123,7 +124,7 @@ def _against_the_hand(results: Path, truth: Path, folder: Path) -> None:
     comparison = or_exit(lambda: compare(measures, read_results(results)))
     found = agreement(comparison.pairs)
     for text in comparison.unmatched:
-        out.print(f"note: {text}", highlight=False)
+        note(text)
     if not found:
         complain(f"{truth}: none of its clouds and traits is among those of {results}; are the clouds' names the same?")
         raise typer.Exit(2)
@@ -133,8 +134,8 @@ def _against_the_hand(results: Path, truth: Path, folder: Path) -> None:
     _show(found, f"{results} against {truth.name}")
     for a in found:
         if a.outliers:
-            out.print(f"note: {a.trait} is far off in {', '.join(a.outliers)}", highlight=False)
-    out.print(f"With plots: {folder / 'validation.html'}", highlight=False)
+            note(f"{a.trait} is far off in {', '.join(a.outliers)}")
+    tell(f"With plots: {folder / 'validation.html'}")
 
 
 def _tried(
@@ -171,7 +172,6 @@ def _tell(
     import pandas as pd
 
     from phytofit.report import trial_page
-    from phytofit.results import write_table
     from phytofit.validation import agreement
     from phytofit.validation.trials import ENOUGH, needed, trial_table
 
@@ -189,12 +189,12 @@ def _tell(
             else:
                 answers.append(f"{said}not with up to {max(made):,} {name} (at best in {100 * most:.0f} %)")
     title = f"{base.n} simulated phytomers, {_described(base.sensor)}"
-    _write(folder, base.comparison.pairs, found, trial_page(base, needs, answers, percent, degrees, title))
-    or_exit(lambda: write_table(folder / "needs.csv", needs))
+    page = trial_page(base, needs, answers, percent, degrees, title)
+    _write(folder, base.comparison.pairs, found, page, needs=needs)
     _show(found, title)
     for text in (*base.comparison.unmatched, *answers):
-        out.print(text, highlight=False)
-    out.print(f"With plots: {folder / 'validation.html'}", highlight=False)
+        tell(text)
+    tell(f"With plots: {folder / 'validation.html'}")
 
 
 def _described(sensor: Mapping[str, Any]) -> str:
@@ -209,25 +209,26 @@ def _described(sensor: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _write(folder: Path, pairs: "pd.DataFrame", found: "Sequence[Agreement]", page: str) -> None:
+def _write(
+    folder: Path, pairs: "pd.DataFrame", found: "Sequence[Agreement]", page: str, **others: "pd.DataFrame"
+) -> None:
     import pandas as pd
 
-    from phytofit.results import write_table, write_text
+    from phytofit.results import save_validation
 
     statistics = pd.DataFrame(found).assign(outliers=["; ".join(a.outliers) for a in found])
-    or_exit(lambda: write_table(folder / "pairs.csv", pairs))
-    or_exit(lambda: write_table(folder / "validation.csv", statistics))
-    or_exit(lambda: write_text(folder / "validation.html", page))
+    tables = {"pairs": pairs, "validation": statistics, **others}
+    or_exit(lambda: save_validation(folder, tables, page))
 
 
 def _show(found: "Sequence[Agreement]", title: str) -> None:
     from phytofit.report import agreement_table
 
     shown = agreement_table(found)
-    table = Table(title=title, box=SIMPLE_HEAD, pad_edge=False)
+    table = Table(title=for_terminal(title), box=SIMPLE_HEAD, pad_edge=False)
     for column in ("trait", *SHOWN):
         table.add_column(column, justify="left" if column == "trait" else "right", no_wrap=True)
     for name, row in zip(shown.index, shown[list(SHOWN)].to_numpy(), strict=True):
         table.add_row(str(name), *row)
     out.print(table)
-    out.print(f"{max(a.flagged for a in found)} of {max(a.n for a in found)} results flagged", highlight=False)
+    tell(f"{max(a.flagged for a in found)} of {max(a.n for a in found)} results flagged")

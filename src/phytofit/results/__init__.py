@@ -32,6 +32,7 @@ from phytofit.results.tables import (
     write_table,
     write_workbook,
 )
+from phytofit.results.validation import save_validation
 
 __all__ = [
     "COLUMNS",
@@ -62,6 +63,7 @@ __all__ = [
     "save_reconstruction",
     "save_segmentation",
     "save_simulated",
+    "save_validation",
     "table_text",
     "trait_table",
     "whole_file",
