@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from phytofit.models import LEAF, STEM, Organ
 
-__all__ = ["CHORD_CM", "Trait", "measure"]
+__all__ = ["CHORD_CM", "Trait", "leaves_stem_at", "measure"]
 
 FloatArray = NDArray[np.float64]
 CHORD_CM = 8.0  # over which leaf_angle is taken
@@ -103,7 +103,7 @@ def _nearest_on(stem: Organ, node_at: FloatArray, point: FloatArray) -> float:
 
 def _leaf(stem: Organ, leaf: Organ, chord_cm: float) -> list[tuple[str, float, str]]:
     node_at = np.concatenate([[0.0], np.cumsum(leaf.segment_lengths)])
-    start = _leaves_stem_at(stem, leaf, node_at)
+    start = leaves_stem_at(stem, leaf)
     length = float(node_at[-1] - start)
     width = float(2.0 * leaf.half_width.max())
     if length <= 0.0:
@@ -135,8 +135,9 @@ def _leaf(stem: Organ, leaf: Organ, chord_cm: float) -> list[tuple[str, float, s
     ]
 
 
-def _leaves_stem_at(stem: Organ, leaf: Organ, node_at: FloatArray) -> float:
-    """Length along the midrib at which it first leaves the stem's surface; its whole length if it never does."""
+def leaves_stem_at(stem: Organ, leaf: Organ) -> float:
+    """Length along the midrib, cm, at which it first leaves the stem's surface; its whole length if it never does."""
+    node_at = np.concatenate([[0.0], np.cumsum(leaf.segment_lengths)])
     at = np.linspace(0.0, node_at[-1], STEPS_PER_SEGMENT * (len(node_at) - 1) + 1)
     points = np.stack([np.interp(at, node_at, leaf.axis[:, a]) for a in range(3)], axis=1)
     depth = np.full(len(at), np.inf)  # distance to the stem's surface, negative inside

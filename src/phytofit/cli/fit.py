@@ -93,11 +93,14 @@ def fit_command(
     folder: OutOption = Path("results"),
     mesh: MeshOption = None,
     workbook: WorkbookOption = False,
+    convergence: Annotated[
+        bool, typer.Option("--convergence", help="Write convergence.png as well: how the search went.")
+    ] = False,
 ) -> None:
     """Measure phytomers: one leaf on its piece of stem a cloud, in any orientation.
 
     Prints a table of traits and writes, for each cloud, DIR/NAME/ with fit.png (the model on the points),
-    convergence.png, traits.csv, model.ply and fit.json; and DIR/traits.csv over all.
+    traits.csv, model.ply and fit.json; and DIR/traits.csv over all.
 
     Examples:
 
@@ -133,7 +136,7 @@ def fit_command(
     def measured(path: Path, name: str) -> "Fit":
         cloud = read_quietly(path, units, labels)
         result = fit_with_progress(cloud, name, settings)
-        save_fit(result, cloud, folder, name, meshes=meshes)
+        save_fit(result, cloud, folder, name, meshes=meshes, convergence=convergence)
         return result
 
     measure_each(

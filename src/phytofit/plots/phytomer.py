@@ -1,109 +1,269 @@
-"""Pictures of a fit: the model on the points, and how the search went."""
+"""Pictures of a fit: the model on the points with what was measured, and how the search went."""
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from phytofit.fitted import Fit
-from phytofit.models import LEAF, STEM, Organ, mesh, move
+from phytofit.models import Organ, mesh
+from phytofit.plots.page import (
+    CELL_IN,
+    GREY,
+    INK,
+    LARGE,
+    MARGIN_IN,
+    NORMAL,
+    PAGE_IN,
+    SMALL,
+    SPACE_IN,
+    Legend,
+    Line,
+    Page,
+    Table,
+    digits,
+    figures,
+    folded,
+    interval,
+    number,
+)
+from phytofit.plots.views import Panel, View, arranged, widest_side
+from phytofit.traits import CHORD_CM, Trait, leaves_stem_at
 
 __all__ = ["plot_convergence", "plot_fit"]
 
 FloatArray = NDArray[np.float64]
-COLORS = {STEM: "#D55E00", LEAF: "#009E73"}  # Okabe and Ito: told apart by the colour-blind
-REFERENCE = "#333333"
-VIEWS = (("from the side", 0, 2), ("from the front", 1, 2), ("from above", 0, 1))
-SHOWN = ("leaf_length", "leaf_angle", "leaf_width", "stem_diameter")
+POINTS = "#3C3C3C"
+STEM_FILL, STEM_EDGE = "#DDAA66", "#8A4B08"  # told apart from the leaf's by the colour-blind, and in grey
+LEAF_FILL, LEAF_EDGE = "#CDEBDA", "#1B7A4B"
+MEASURE, SPREAD = "#0B3FA0", "#C5D3EC"
+TABLE_IN = 3.4  # width of the table and of what stands below it
+COLUMNS_IN = (1.2, 1.05, 1.15)
+HIGHEST_IN = 7.0  # of the views
+DOTTED = 0.35  # dots, as a share of the room that the cloud takes up: the model is seen behind them
+ARC_IN = 0.4  # radius of the angle's arc
+STEEPEST_DEG = 60.0  # of the view onto the blade: from higher up it would not show which way is up
+MOST_LINES = 4  # of a remark
+SHOWN = {
+    "leaf_length": "leaf length",
+    "leaf_angle": "leaf angle",
+    "leaf_width": "leaf width",
+    "leaf_area": "leaf area",
+    "stem_diameter": "stem diameter",
+}
 
 
 def plot_fit(result: Fit, title: str = "") -> Figure:
-    """The reference cloud and the fitted model from three sides, upright, cm (or relative lengths)."""
-    upright: FloatArray = np.linalg.inv(result.pose).astype(float)
-    points = result.reference @ upright[:3, :3].T + upright[:3, 3]
-    organs = move(result.organs, upright)
-    drawn = np.concatenate([points, *(organ.axis for organ in organs)])
-    span = np.ptp(drawn, axis=0) + 4.0 * result.scale
-    widths = [span[a] for _, a, _ in VIEWS]
-    figure = Figure(figsize=(13.0, 6.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, 3, width_ratios=[max(w, 0.35 * max(widths)) for w in widths])
-    unit = "relative length" if result.relative else "cm"
-    for ax, (name, a, b) in zip(axes, VIEWS, strict=True):
-        ax.scatter(points[:, a], points[:, b], s=1.2, c=REFERENCE, linewidths=0, rasterized=True, zorder=1)
-        for organ in organs:
-            _draw(ax, organ, a, b)
-        ax.set_aspect("equal")
-        ax.xaxis.set_major_locator(MaxNLocator(nbins=max(1, round(9 * span[a] / max(widths)))))
-        ax.set_xlabel(f"{'xyz'[a]} ({unit})")
-        ax.set_ylabel(f"{'xyz'[b]} ({unit})")
-        ax.set_title(name, fontsize=10)
-        ax.grid(alpha=0.25)
-    handles = [
-        Line2D([], [], marker="o", linestyle="", markersize=3, color=REFERENCE, label="reference cloud"),
-        Line2D([], [], linewidth=6, alpha=0.5, color=COLORS[STEM], label="fitted stem"),
-        Line2D([], [], linewidth=6, alpha=0.5, color=COLORS[LEAF], label="fitted leaf, midrib in black"),
+    """The cloud and the fitted model, upright, from the side and facing the blade, with the length, angle, width and
+    diameter that were measured; beside them the table of traits, and what to check."""
+    stem, leaf = result.organs
+    up = result.pose[:3, 2]
+    side = widest_side(leaf.axis - leaf.axis[0], up)
+    views = (View("from the side", np.stack([side, up])), View("facing the blade", _facing(leaf, up, side)))
+    room = PAGE_IN - TABLE_IN - 3.0 * MARGIN_IN
+    traits = {trait.name: trait for trait in result.traits}
+    text, table, remarks = _heading(result, title), _table(traits), _remarks(result)
+    beside = sum(line.height for line in (*text, *remarks)) + table.height + 2.0 * SPACE_IN
+    legend = Legend(_marks(result), room)
+    drawn = np.concatenate([result.reference, _outline(stem), _outline(leaf)])
+    shown = arranged(views, drawn, room, max(HIGHEST_IN, beside - legend.height))
+    page = Page(max(beside, shown.height + legend.height) + 2.0 * MARGIN_IN)
+    left = 2.0 * MARGIN_IN + room
+    top = page.write_all(left, MARGIN_IN, text) + SPACE_IN
+    top = table.draw(page, left, top) + SPACE_IN
+    page.write_all(left, top, remarks)
+    at = MARGIN_IN + 0.5 * (room - shown.width)
+    panels = shown.panels(page, at, MARGIN_IN, "rel" if result.relative else "cm")
+    for panel in panels:
+        panel.up_arrow(stem.axis[0], up)
+        _draw_model(panel, result)
+    _draw_measures(panels[0], panels[1], result, traits)
+    legend.draw(page, MARGIN_IN, MARGIN_IN + shown.height)
+    return page.figure
+
+
+def _heading(result: Fit, title: str) -> list[Line]:
+    lines = [Line(text, LARGE, bold=True) for text in folded(title, TABLE_IN, 2, LARGE, bold=True)]
+    said = f"{len(result.reference):,} points, fitted by the method “{result.method}”"
+    if result.relative:
+        said += "; lengths are relative, as the cloud has no unit"
+    return lines + [Line(text, color=GREY) for text in folded(said, TABLE_IN, 2)]
+
+
+def _table(traits: dict[str, Trait]) -> Table:
+    """The traits with their intervals."""
+    rows = [tuple((Line(text, color=GREY),) for text in ("trait", "value", "95 % interval"))]
+    for name, said in SHOWN.items():
+        trait = traits[name]
+        decimals = digits(trait.value, trait.low, trait.high)
+        unit = "°" if trait.unit == "deg" else f" {trait.unit}"
+        value = number(trait.value, decimals) + unit
+        ends = interval(trait.low, trait.high, decimals) or "not given"
+        cells = figures(value, COLUMNS_IN[1] - 2.0 * CELL_IN, bold=True), figures(ends, COLUMNS_IN[2] - 2.0 * CELL_IN)
+        rows.append(((Line(said, NORMAL),), (cells[0],), (cells[1],)))
+    return Table(COLUMNS_IN, ("left", "right", "right"), tuple(rows))
+
+
+def _remarks(result: Fit) -> list[Line]:
+    if not result.flags:
+        return [Line("Nothing to check: no flag.", color=GREY)]
+    lines = [Line("To check", NORMAL, bold=True)]
+    for flag in result.flags:
+        first, *others = folded(f"• {flag}", TABLE_IN, MOST_LINES)
+        lines += [Line(first), *(Line(f"   {other}") for other in others)]
+    return lines
+
+
+def _marks(result: Fit) -> tuple[tuple[str, str, str], ...]:
+    """The legend of the views."""
+    marks = [
+        ("dot", POINTS, "cloud"),
+        ("area", STEM_FILL, "fitted stem"),
+        ("area", LEAF_FILL, "fitted leaf"),
+        ("line", MEASURE, "what was measured"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
-    found = {trait.name: trait for trait in result.traits}
-    numbers = ", ".join(f"{name.replace('_', ' ')} {found[name].value:.1f} {found[name].unit}" for name in SHOWN)
-    lines = [title, numbers.replace(" deg", "°"), *(f"flag: {flag}" for flag in result.flags)]
-    figure.suptitle("\n".join(line for line in lines if line), fontsize=11)
-    figure.draw_without_rendering()  # the layout is right from the second time on
-    return figure
+    if result.estimate is not None and result.estimate.seen < 1.0:
+        marks.append(("dashed", MEASURE, "not seen"))
+    return tuple(marks)
 
 
-def _draw(ax: Axes, organ: Organ, a: int, b: int) -> None:
-    """An organ's surface, half transparent, over the points; its midrib or axis as a line."""
-    surface = mesh([organ], n_around=16)
-    triangles = np.asarray(surface.vertices)[np.asarray(surface.faces)][:, :, [a, b]]
-    color = COLORS[organ.kind]
-    ax.add_collection(PolyCollection(list(triangles), facecolor=color, edgecolor="none", alpha=0.25, zorder=2))
-    ax.add_collection(PolyCollection(list(triangles), facecolor="none", edgecolor=color, lw=0.25, alpha=0.6, zorder=3))
-    if organ.kind == LEAF:
-        ax.add_collection(LineCollection([organ.axis[:, [a, b]]], colors="black", linewidths=1.0, zorder=4))
+def _facing(leaf: Organ, up: FloatArray, side: FloatArray) -> FloatArray:
+    """Axes (2, 3) of the view in which most of the blade's area is seen, from the leaf's own side where others are as
+    good, level or from above."""
+    azimuth, height = np.deg2rad(np.mgrid[-180:180:5, 0 : STEEPEST_DEG + 1.0 : 5].reshape(2, -1))
+    beside = np.cross(up, side)
+    level = np.cos(azimuth)[:, np.newaxis] * side + np.sin(azimuth)[:, np.newaxis] * beside
+    eyes = np.cos(height)[:, np.newaxis] * level + np.sin(height)[:, np.newaxis] * up
+    area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
+    seen = np.abs(eyes @ leaf.frame[:, :, 2].T) @ area
+    best = int(np.argmax(np.round(seen / max(seen.max(), 1e-300), 6) + 1e-3 * (level @ side)))
+    right = np.cross(up, level[best])
+    return np.stack([right, np.cross(eyes[best], right)])
+
+
+def _outline(organ: Organ) -> FloatArray:
+    """Corners (n, 3) of the organ's surface."""
+    return np.asarray(mesh([organ], n_around=32).vertices)
+
+
+def _draw_model(panel: Panel, result: Fit) -> None:
+    """Stem and leaf, the points on them, and their edges."""
+    for organ, fill, zorder in zip(result.organs, (STEM_FILL, LEAF_FILL), (1.0, 1.5), strict=True):
+        surface = mesh([organ], n_around=32)
+        panel.surface(np.asarray(surface.vertices)[np.asarray(surface.faces)], fill, zorder=zorder)
+    panel.dots(result.reference, POINTS, size=panel.dot_size(result.reference, DOTTED))
+    stem, leaf = result.organs
+    across = panel.view.axes[0]
+    for sign in (-1.0, 1.0):
+        panel.line(stem.axis + sign * stem.half_width[:, np.newaxis] * across, STEM_EDGE, 1.0, zorder=3.0)
+        lateral = np.concatenate([leaf.frame, leaf.frame[-1:]])[:, :, 1]
+        panel.line(leaf.axis + sign * leaf.half_width[:, np.newaxis] * lateral, LEAF_EDGE, 1.0, zorder=3.0)
+
+
+def _draw_measures(side: Panel, facing: Panel, result: Fit, traits: dict[str, Trait]) -> None:
+    """What was measured, drawn and named where it shows: length, angle and diameter from the side, width facing the
+    blade."""
+    stem, leaf = result.organs
+    start = leaves_stem_at(stem, leaf)
+    whole = float(leaf.segment_lengths.sum())
+    if not 0.0 <= start < whole:
+        return
+    at = np.concatenate([[0.0], np.cumsum(leaf.segment_lengths)])
+    collar = _on(leaf, at, start)
+    seen = whole if result.estimate is None else min(1.0, result.estimate.seen) * whole
+    for panel in (side, facing):
+        panel.line(_part(leaf, at, start, max(seen, start)), MEASURE, 1.8)
+        panel.line(_part(leaf, at, max(seen, start), whole), MEASURE, 1.8, style=":")
+    up = result.pose[:3, 2]
+    chord = min(np.inf if result.relative else CHORD_CM, (whole - start) / 5.0)
+    toward = _on(leaf, at, start + chord) - collar
+    toward = toward / np.linalg.norm(toward)
+    ray = min(1.5 * ARC_IN / side.scale, side.room(collar, up), side.room(collar, toward))
+    radius = ray / 1.5
+    arc = _arc(up, toward)
+    side.line(np.stack([collar, collar + ray * up]), MEASURE, 1.2)
+    side.line(np.stack([collar, collar + ray * toward]), MEASURE, 1.2)
+    side.line(collar + radius * arc, MEASURE, 1.2)
+    base = stem.axis[0] + 0.5 * ((collar - stem.axis[0]) @ up) * up
+    across = 0.5 * traits["stem_diameter"].value * side.view.axes[0]
+    side.line(np.stack([base - across, base + across]), MEASURE, 1.8)
+    widest = int(np.argmax(leaf.half_width))
+    lateral = leaf.half_width[widest] * leaf.frame[min(widest, len(leaf.frame) - 1), :, 1]
+    facing.line(np.stack([leaf.axis[widest] - lateral, leaf.axis[widest] + lateral]), MEASURE, 1.8)
+    side.label(_said("angle ", traits["leaf_angle"]), collar + radius * arc[len(arc) // 2], color=MEASURE)
+    side.label(_said("length ", traits["leaf_length"]), _on(leaf, at, 0.5 * (start + whole)), color=MEASURE)
+    side.label(_said("diameter ", traits["stem_diameter"]), base + across, color=MEASURE)
+    facing.label(_said("width\n", traits["leaf_width"]), leaf.axis[widest] + lateral, color=MEASURE)
+
+
+def _said(name: str, trait: Trait) -> str:
+    unit = {"deg": "°", "rel": ""}.get(trait.unit, f" {trait.unit}")
+    return f"{name}{number(trait.value, digits(trait.value, trait.low, trait.high))}{unit}"
+
+
+def _on(leaf: Organ, at: FloatArray, s: float) -> FloatArray:
+    return np.array([np.interp(s, at, leaf.axis[:, a]) for a in range(3)])
+
+
+def _part(leaf: Organ, at: FloatArray, start: float, end: float) -> FloatArray:
+    """The midrib (n, 3) from one length along it to another."""
+    inside = leaf.axis[(at > start) & (at < end)]
+    return np.concatenate([[_on(leaf, at, start)], inside, [_on(leaf, at, end)]])
+
+
+def _arc(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Unit vectors (n, 3) from one (3,) to another, evenly turned."""
+    turn = np.arctan2(np.linalg.norm(np.cross(first, second)), first @ second)
+    beside = second - (second @ first) * first
+    beside = beside / max(float(np.linalg.norm(beside)), 1e-12)
+    angle = np.linspace(0.0, turn, 24)[:, np.newaxis]
+    return np.asarray(np.cos(angle) * first + np.sin(angle) * beside)
 
 
 def plot_convergence(result: Fit) -> Figure:
-    """Mean and spread of the elite for each parameter, and its errors, over the generations (Fig. 6b)."""
+    """How the search went: mean and spread of the elite for each parameter, and its errors, over the generations
+    (Fig. 6b)."""
     searched = len(result.history[0].mean)
     names, units = result.species.space.names[:searched], result.species.space.units[:searched]
     generation = np.array([g.index for g in result.history])
-    mean = np.array([g.mean for g in result.history])
-    std = np.array([np.sqrt(np.diag(g.cov)) for g in result.history])
     scale = np.array([result.scale if unit == "cm" else 1.0 for unit in units])
-    mean, std = mean * scale, std * scale
-    figure = Figure(figsize=(13.0, 6.0), layout="constrained")
+    mean = np.array([g.mean for g in result.history]) * scale
+    std = np.array([np.sqrt(np.diag(g.cov)) for g in result.history]) * scale
+    length = "rel" if result.relative else "cm"
+    n_columns = 4
+    n_rows = -(-(len(names) + 1) // n_columns)
+    figure = Figure(figsize=(PAGE_IN, 2.2 * n_rows + 0.5), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(2, (len(names) + 2) // 2, sharex=True).ravel()
+    axes = figure.subplots(n_rows, n_columns, squeeze=False).ravel()
     for i, (ax, name, unit) in enumerate(zip(axes, names, units, strict=False)):
-        ax.fill_between(generation, mean[:, i] - std[:, i], mean[:, i] + std[:, i], color="#0072B2", alpha=0.25, lw=0)
-        ax.plot(generation, mean[:, i], color="#0072B2", marker="o", markersize=3)
+        ax.fill_between(generation, mean[:, i] - std[:, i], mean[:, i] + std[:, i], color=SPREAD, lw=0)
+        ax.plot(generation, mean[:, i], color=MEASURE, marker="o", markersize=3)
         if result.estimate is not None:
-            ax.axhline(result.parameters[name], color="black", lw=1.0, ls="--")
-        ax.set_title(name.replace("_", " "), fontsize=10)
-        ax.set_ylabel("relative length" if result.relative and unit == "cm" else unit)
-    ax = axes[len(names)]
-    ax.plot(
-        generation, [g.threshold * result.scale for g in result.history], color="#D55E00", label="worst of the elite"
-    )
-    ax.plot(generation, [g.best_error * result.scale for g in result.history], color="#009E73", label="best", ls="--")
-    ax.set_title("error", fontsize=10)
-    ax.set_ylabel("relative length" if result.relative else "cm")
-    ax.legend(frameon=False, fontsize=8)
-    for ax in axes:
+            ax.axhline(result.parameters[name], color=INK, lw=1.2, ls="--")
+        ax.set_title(f"{name.replace('_', ' ')} ({length if unit == 'cm' else unit})", fontsize=SMALL)
+    errors = axes[len(names)]
+    errors.plot(generation, [g.threshold * result.scale for g in result.history], color=STEM_EDGE)
+    errors.plot(generation, [g.best_error * result.scale for g in result.history], color=LEAF_EDGE, ls=":")
+    errors.set_title(f"error ({length})", fontsize=SMALL)
+    for ax in axes[: len(names) + 1]:
         ax.grid(alpha=0.25)
-        ax.set_xlabel("generation")
-        ax.xaxis.get_major_locator().set_params(integer=True)
+        ax.tick_params(labelsize=SMALL)
+        ax.xaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
+        ax.yaxis.set_major_locator(MaxNLocator(nbins=4))
     for ax in axes[len(names) + 1 :]:
         ax.remove()
-    figure.suptitle(
-        "Elite mean and standard deviation in each generation of the search: how far it has contracted, not the error"
-        + ("; dashed: after refinement" if result.estimate is not None else ""),
-        fontsize=11,
-    )
+    figure.supxlabel("generation of the search", fontsize=SMALL)
+    marks = [
+        (Line2D([], [], color=MEASURE, marker="o", markersize=3), "mean of the best candidates"),
+        (Patch(color=SPREAD), "their spread: how far the search has come, not the error"),
+        (Line2D([], [], color=STEM_EDGE), "worst of them"),
+        (Line2D([], [], color=LEAF_EDGE, ls=":"), "best"),
+    ]
+    if result.estimate is not None:
+        marks.insert(2, (Line2D([], [], color=INK, ls="--"), "the fit"))
+    handles, texts = zip(*marks, strict=True)
+    figure.legend(handles, texts, loc="outside upper left", ncols=3, frameon=False, fontsize=SMALL)
     return figure

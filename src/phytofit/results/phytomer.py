@@ -45,12 +45,19 @@ def fit_tables(folder: Path) -> FolderTable:
 
 
 def save_fit(
-    result: Fit, cloud: PointCloud, folder: str | Path, name: str | None = None, *, meshes: Sequence[str] = ("ply",)
+    result: Fit,
+    cloud: PointCloud,
+    folder: str | Path,
+    name: str | None = None,
+    *,
+    meshes: Sequence[str] = ("ply",),
+    convergence: bool = False,
 ) -> Path:
-    """Write ``folder/name/``: fit.json, traits.csv, model.ply, fit.png and convergence.png; all of them or none.
+    """Write ``folder/name/``: fit.json, traits.csv, model.ply and fit.png; all of them or none.
 
     A folder of that name from an earlier run is replaced; files in it that phytofit did not make are kept.  The model
-    is in the input's unit and frame; `meshes` says in which formats, of ply, obj and glb.
+    is in the input's unit and frame; `meshes` says in which formats, of ply, obj and glb.  With `convergence`, there is
+    convergence.png too: how the search went.
 
     Raises NoPhytomerError where a trait is not a number, OutputError where the result can't be written.
     """
@@ -61,7 +68,8 @@ def save_fit(
         for kind in dict.fromkeys(("ply", *meshes)):
             write_mesh(part / f"model.{kind}", result.organs, cloud)
         plot_fit(result, title=name).savefig(part / "fit.png", dpi=150, metadata={"Software": None})
-        plot_convergence(result).savefig(part / "convergence.png", dpi=150, metadata={"Software": None})
+        if convergence:
+            plot_convergence(result).savefig(part / "convergence.png", dpi=150, metadata={"Software": None})
         said = _as_json(result, cloud, name) | {"files": files_made(part)}
         (part / "fit.json").write_text(json_text(said), encoding="utf-8", newline="")
     return Path(folder) / name
