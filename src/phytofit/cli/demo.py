@@ -19,16 +19,15 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
     Needs no data and no screen; the picture to look at is DIR/phytomer_0001/fit.png.
     """
     from phytofit.cloud import read_cloud
-    from phytofit.results import clear_simulated, prepare_folder, save_fit, save_simulated
+    from phytofit.results import prepare_folder, save_fit, save_simulated
     from phytofit.simulation import simulate
     from phytofit.species import load_species
     from phytofit.traits import measure
 
     or_exit(lambda: prepare_folder(folder))
-    or_exit(lambda: clear_simulated(folder))
     species = load_species()
     made = simulate(species, n_spheres=2, seed=seed)
-    cloud_file = or_exit(lambda: save_simulated(made, species, folder, "phytomer_0001", with_labels=False))
+    cloud_file = or_exit(lambda: save_simulated([made], species, folder, with_labels=False, table=False))[0]
     tell(f"Simulated a phytomer: {len(made.points)} points, 0.5 cm noise, two 6 cm spheres cut out, random pose.")
     tell(f"Measuring it: phytofit fit {cloud_file} --units cm --out {folder}")
     cloud = or_exit(lambda: read_cloud(cloud_file, "cm"))

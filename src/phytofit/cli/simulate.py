@@ -58,38 +58,30 @@ def simulate_command(
 
         phytofit simulate --number 10 --noise 0.5 --spheres 1 --set leaf_length=60 --out simulated
     """
-    import pandas as pd
-
-    from phytofit.results import clear_simulated, prepare_folder, save_simulated, trait_table, write_table
+    from phytofit.results import prepare_folder, save_simulated
     from phytofit.simulation import simulate
     from phytofit.species import load_species
-    from phytofit.traits import measure
 
     chosen = or_exit(lambda: load_species(species))
     fixed = or_exit(lambda: _parse_parameters(parameters or [], chosen))
     or_exit(lambda: prepare_folder(folder))
-    or_exit(lambda: clear_simulated(folder))
-    tables = []
-    for i in range(number):
-        made = or_exit(
-            lambda i=i: simulate(
-                chosen,
-                fixed=fixed,
-                n_points=points,
-                noise_cm=noise,
-                noise_reach_cm=noise_reach,
-                n_views=views,
-                n_spheres=spheres,
-                sphere_diameter_cm=sphere_diameter,
-                outlier_share=outliers,
-                random_orientation=not upright,
-                seed=seed + i,
-            )
+    made = (
+        simulate(
+            chosen,
+            fixed=fixed,
+            n_points=points,
+            noise_cm=noise,
+            noise_reach_cm=noise_reach,
+            n_views=views,
+            n_spheres=spheres,
+            sphere_diameter_cm=sphere_diameter,
+            outlier_share=outliers,
+            random_orientation=not upright,
+            seed=seed + i,
         )
-        name = f"phytomer_{i + 1:04d}"
-        or_exit(lambda made=made, name=name: save_simulated(made, chosen, folder, name))
-        tables.append(trait_table(name, measure(made.organs, method="truth")))
-    or_exit(lambda: write_table(folder / "truth.csv", pd.concat(tables)))
+        for i in range(number)
+    )
+    or_exit(lambda: save_simulated(made, chosen, folder))
     tell(f"{number} phytomers in {folder}, their true traits in {folder / 'truth.csv'}")
 
 

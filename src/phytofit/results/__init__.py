@@ -22,7 +22,7 @@ from phytofit.results.replacing import (
     whole_files,
     whole_folder,
 )
-from phytofit.results.simulated import clear_simulated, save_simulated
+from phytofit.results.simulated import save_simulated
 from phytofit.results.tables import (
     FolderTable,
     check_table,
@@ -44,7 +44,6 @@ __all__ = [
     "check_meshes",
     "check_reconstruction",
     "check_table",
-    "clear_simulated",
     "delete_made",
     "file_hash",
     "files_made",

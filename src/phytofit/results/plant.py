@@ -30,7 +30,7 @@ __all__ = [
 
 LENGTHS = ("collar_distance", "collar_height", "length")
 LEAF_COLUMNS = [
-    *("cloud", "rank", "label", "azimuth_deg", "n_points", "flags"),
+    *("cloud", "plant", "rank", "label", "azimuth_deg", "n_points", "flags"),
     *(f"{name}_{unit}" for name in LENGTHS for unit in ("cm", "rel")),
 ]
 

@@ -17,7 +17,7 @@ import shutil
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -36,6 +36,7 @@ __all__ = [
 ]
 
 PART, DONE, OLD = ".phytofit-part-", ".phytofit-done-", ".phytofit-old-"
+GONE = ".gone"  # names of what a finished result replaces by nothing
 HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:8]
 PROCESS = uuid.uuid4().hex[:8]  # a process that ended may have had our number
 COUNT = itertools.count()
@@ -85,9 +86,9 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_files(folder: Path) -> Iterator[Path]:
-    """A hidden folder to write into; when all is written its files go to ``folder``, in the place of older ones: all
-    of them or none.  OutputError if they can't."""
+def whole_files(folder: Path, instead_of: Iterable[Path] = ()) -> Iterator[Path]:
+    """A hidden folder to write into; when all is written its files go to ``folder``, in the place of older ones, and
+    `instead_of` those that are deleted: all of this is done, or nothing.  OutputError if it can't."""
     prepare_folder(folder)
     with (
         _said(folder, "the result can't be written", ROOM),
@@ -201,29 +202,34 @@ def _free(path: Path) -> Path:
 
 
 def _install(done: Path) -> None:
-    """Put each file and folder of a finished result in its place; take all back if that fails."""
+    """Put each file and folder of a finished result in its place, and those away that it replaces; take all back if
+    that fails."""
     folder, old = done.parent, done.with_name(done.name.replace(DONE, OLD))
-    placed = []
+    gone = (done / GONE).read_text(encoding="utf-8").splitlines() if (done / GONE).exists() else []
+    moved = []
     try:
-        for entry in sorted(done.iterdir()):
-            target = folder / entry.name
-            if os.path.lexists(target):
+        for name in sorted({*gone, *(entry.name for entry in done.iterdir())} - {GONE}):
+            moved.append(name)
+            if os.path.lexists(folder / name):
                 old.mkdir(exist_ok=True)
-                target.rename(old / entry.name)
-            placed.append(target)
-            entry.rename(target)
+                (folder / name).rename(old / name)
+            if os.path.lexists(done / name):
+                (done / name).rename(folder / name)
     except BaseException:
         with contextlib.suppress(OSError):  # then the next start goes on from here
-            for target in placed:
-                if os.path.lexists(target):
-                    target.rename(done / target.name)
-                if os.path.lexists(old / target.name):
-                    (old / target.name).rename(target)
+            for name in moved:
+                if os.path.lexists(old / name):
+                    if os.path.lexists(folder / name):
+                        (folder / name).rename(done / name)
+                    (old / name).rename(folder / name)
+                elif not os.path.lexists(done / name) and name not in gone:
+                    (folder / name).rename(done / name)
             _delete(done)
             _delete(old)
         raise
-    _forget(done)
-    _forget(old)
+    with contextlib.suppress(OSError):  # the same
+        _delete(old)
+        _delete(done)
 
 
 def _hidden(kind: str) -> str:

@@ -1,55 +1,69 @@
 """What simulated phytomers look like on disk: a cloud and its truth for each, and a table over all."""
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 
+import pandas as pd
+
 from phytofit.cloud import PointCloud, write_cloud
-from phytofit.results.files import files_made, json_text
-from phytofit.results.phytomer import COLUMNS
+from phytofit.results.files import json_text
+from phytofit.results.phytomer import COLUMNS, trait_table
 from phytofit.results.replacing import check_made, file_hash, whole_files
-from phytofit.results.tables import check_table
+from phytofit.results.tables import check_table, write_table
 from phytofit.simulation import SimulatedPhytomer
 from phytofit.species import Species
 from phytofit.traits import measure
 
-__all__ = ["clear_simulated", "save_simulated"]
+__all__ = ["save_simulated"]
 
 NAMES = "phytomer_[0-9]*"
 TRUTH = "truth.csv"
 
 
 def save_simulated(
-    made: SimulatedPhytomer, species: Species, folder: Path, name: str, *, with_labels: bool = True
-) -> Path:
-    """Write ``folder/name.ply``, cm, and ``folder/name.json``, its truth: both or none; the path of the cloud."""
-    cloud = PointCloud(made.points, labels=made.labels if with_labels else None, name=name)
-    with whole_files(folder) as part:
-        write_cloud(part / f"{name}.ply", cloud)
-        truth = {
-            "parameters": dict(zip(species.space.names, made.x.tolist(), strict=True)),
-            "traits": {t.name: t.value for t in measure(made.organs)},
-            "pose": made.pose.tolist(),
-            "units": "cm, deg",
-            "files": files_made(part),
-        }
-        (part / f"{name}.json").write_text(json_text(truth), encoding="utf-8", newline="")
-    return folder / f"{name}.ply"
+    made: Iterable[SimulatedPhytomer], species: Species, folder: Path, *, with_labels: bool = True, table: bool = True
+) -> list[Path]:
+    """Write ``folder/phytomer_0001.ply``, cm, and ``.json``, its truth, for each phytomer and on, and with `table`
+    ``truth.csv`` over all; the paths of the clouds.
+
+    What an earlier run simulated into the folder is deleted, so that no cloud stands beside a table without it; until
+    all is made nothing is.
+
+    Raises OutputError if that can't be done, or if there is such a file that is not of an earlier run, or was changed.
+    """
+    earlier = _earlier(folder)
+    clouds, tables = [], []
+    with whole_files(folder, earlier if table else ()) as part:
+        for i, phytomer in enumerate(made, start=1):
+            name = f"phytomer_{i:04d}"
+            labels = phytomer.labels if with_labels else None
+            write_cloud(part / f"{name}.ply", PointCloud(phytomer.points, labels=labels, name=name))
+            truth = {
+                "parameters": dict(zip(species.space.names, phytomer.x.tolist(), strict=True)),
+                "traits": {t.name: t.value for t in measure(phytomer.organs)},
+                "pose": phytomer.pose.tolist(),
+                "units": "cm, deg",
+                "files": {f"{name}.ply": file_hash(part / f"{name}.ply")},
+            }
+            (part / f"{name}.json").write_text(json_text(truth), encoding="utf-8", newline="")
+            clouds.append(folder / f"{name}.ply")
+            tables.append(trait_table(name, measure(phytomer.organs, method="truth")))
+        if table:
+            write_table(part / TRUTH, pd.concat(tables))
+    return clouds
 
 
-def clear_simulated(folder: Path) -> None:
-    """Delete the clouds that an earlier run simulated into the folder, and their truth, so that none stands beside a
-    new table.  OutputError, before anything is deleted, if one was changed since, or is no such cloud."""
+def _earlier(folder: Path) -> list[Path]:
+    """What an earlier run simulated into the folder; OutputError if it was changed since, or is of somebody else."""
     check_table(folder / TRUTH, COLUMNS)
-    truths = sorted(folder.glob(f"{NAMES}.json"))
-    clouds = sorted(folder.glob(f"{NAMES}.ply"))
     made: dict[str, str] = {}
-    for file in truths:
+    for file in sorted(folder.glob(f"{NAMES}.json")):
         made |= _made(file)
         check_made(file, lambda path: bool(_made(path)))
-    for file in clouds:
+    for file in sorted(folder.glob(f"{NAMES}.ply")):
         check_made(file, lambda path: made.get(path.name) == file_hash(path))
-    for file in (folder / TRUTH, *clouds, *truths):  # a cloud before what says whose it is
-        file.unlink(missing_ok=True)
+    return [path for pattern in (TRUTH, f"{NAMES}.json", f"{NAMES}.ply") for path in sorted(folder.glob(pattern))]
 
 
 def _made(truth: Path) -> dict[str, str]:
