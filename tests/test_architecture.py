@@ -38,7 +38,7 @@ LAYERS = [
     {"cloud"},
     {"kernels"},
     {"ordering", "parameters", "parsing"},
-    {"bundled", "errors", "text"},
+    {"bundled", "errors", "silence", "text"},
 ]
 DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}
 

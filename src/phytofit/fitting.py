@@ -98,6 +98,7 @@ def fit(
         cloud = from_points(cloud, units)
     elif units not in (None, cloud.unit):
         raise SettingError(f"units: {cloud.name} was read in {cloud.unit}, got {units!r}; leave units out")
+    cloud = cloud.unrounded()
     search: dict[str, Any] = {"elite_fraction": elite_fraction, "covariance_noise": covariance_noise}
     given = {"n_samples": n_samples, "n_points": n_points, "n_generations": n_generations, "distance": distance}
     search |= {name: value for name, value in given.items() if value is not None}

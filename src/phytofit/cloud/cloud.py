@@ -9,14 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from phytofit.cloud.copies import places_of, unrounded
 from phytofit.cloud.thinning import size_cm
 from phytofit.cloud.units import SCALE_CM, checked_unit
 from phytofit.errors import CloudError
+from phytofit.text import one_line
 
 __all__ = ["MIN_POINTS", "PointCloud", "from_points"]
 
 MIN_POINTS = 100  # fewer can't carry a stem and a leaf
 FAR_CM = 1e6  # coordinates beyond 10 km are map coordinates: their offset is subtracted
+FAR_STEPS = 2**22  # steps from the origin, beyond which single precision has no finer ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,8 @@ class PointCloud:
     unit: str = "cm"  # of the input: mm, cm, m or none
     offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))  # (3,) cm, was subtracted
     notes: tuple[str, ...] = ()  # plain-words remarks collected while reading
+    labels_from: str | None = None  # the property or column that the labels were
+    step: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))  # (3,) cm, of the coarse grid; 0: none
 
     def __post_init__(self) -> None:
         n = len(self.points)
@@ -41,6 +46,7 @@ class PointCloud:
             ("normals", np.float64, (n, 3)),
             ("colors", np.uint8, (n, 3)),
             ("offset", np.float64, (3,)),
+            ("step", np.float64, (3,)),
         ):
             if getattr(self, key) is None:
                 continue
@@ -69,6 +75,13 @@ class PointCloud:
         shifted: NDArray[np.float64] = points * SCALE_CM[self.unit] - self.offset
         return shifted
 
+    def unrounded(self) -> "PointCloud":
+        """Return the cloud with each point anywhere within the step by which its coordinates were rounded.
+
+        It is the same cloud where they have enough digits.
+        """
+        return replace(self, points=unrounded(self.points, self.step)) if self.step.any() else self
+
     def with_note(self, text: str) -> "PointCloud":
         """Return the same cloud with one more remark."""
         return replace(self, notes=(*self.notes, text))
@@ -79,22 +92,26 @@ def from_points(
     units: str | None,
     *,
     labels: ArrayLike | None = None,
+    labels_from: str | None = None,
     normals: ArrayLike | None = None,
     colors: ArrayLike | None = None,
     name: str = "cloud",
     source: Path | None = None,
     plausible_cm: tuple[float, float] = (10.0, 250.0),
 ) -> PointCloud:
-    """Make a cloud from arrays: check them, drop what is not finite, convert to centimetres.
+    """Make a cloud from arrays: check them, drop what is no measured point, convert to centimetres.
 
     Parameters
     ----------
     points
-        (n, 3), in `units`; rows that are not finite are dropped, with a note and one warning.
+        (n, 3), in `units`.  Dropped, with a note, are rows that are not finite, exact copies of others, and stacks of
+        points at one place, where a sensor saw nothing; but for copies, one warning says so too.
     units
         ``mm``, ``cm``, ``m``, or ``none`` for relative lengths (no conversion and no check of the size).
-    labels, normals, colors
-        (n,) whole numbers; (n, 3), what is not finite becomes 0; (n, 3) 0 to 255, fractions of 1, or 16 bit.
+    labels, labels_from
+        (n,) whole numbers (0 unknown, 1 stem, 2.. leaves), NaN: unknown; and what they are called, for the notes.
+    normals, colors
+        (n, 3), what is not finite becomes 0; (n, 3) 0 to 255, fractions of 1, or 16 bit.
     name, source
         The cloud's name and the file it came from; messages call it by its file if there is one.
     plausible_cm
@@ -107,12 +124,52 @@ def from_points(
     UnitError
         If the unit is missing, unknown, or gives a size outside `plausible_cm`.
     """
-    called = source.name if source else name
+    called = one_line(source.name if source else name)
+    xyz, finite, notes = _finite(called, points)
+    places = places_of(xyz)
+    notes += places.stacks
+    if places.n_copies:
+        notes += (f"{places.n_copies} exact cop{'ies' if places.n_copies > 1 else 'y'} of points dropped",)
+    xyz, kept = xyz[places.kept], finite.copy()
+    kept[finite] = places.kept
+    if len(xyz) < MIN_POINTS:
+        why = f" ({'; '.join(notes)})" if notes else ""
+        raise CloudError(
+            f"{called}: found {len(xyz)} points{why}, at least {MIN_POINTS} are needed to fit; is this the whole cloud?"
+        )
+    unit = checked_unit(called, units, size_cm(xyz), plausible_cm)
+    if places.step.any():
+        notes += (_few_digits(called, xyz, places.step, unit),)
+    if lost := [note for note in notes if "exact cop" not in note]:
+        warnings.warn(f"{called}: {'; '.join(lost)}", UserWarning, stacklevel=2)
+    if labels is not None:
+        labels, about = _whole_labels(called, _matching(called, "labels", labels, kept), labels_from)
+        notes += (about,)
+    xyz *= SCALE_CM[unit]
+    offset = np.floor(xyz.min(axis=0)) if np.abs(xyz).max() > FAR_CM else np.zeros(3)
+    return PointCloud(
+        points=xyz - offset,
+        labels=labels,
+        normals=None if normals is None else _known(_matching(called, "normals", normals, kept)),
+        colors=None if colors is None else _uint8(_matching(called, "colors", colors, kept)),
+        name=name,
+        source=source,
+        unit=unit,
+        offset=offset,
+        notes=notes,
+        labels_from=None if labels is None else labels_from,
+        step=places.step * SCALE_CM[unit],
+    )
+
+
+def _finite(called: str, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.bool_], tuple[str, ...]]:
+    """The finite points (m, 3), which of those given they are (n,), and a note if some are not."""
     try:
         with np.errstate(invalid="ignore"):  # signalling NaNs
             xyz = np.array(points, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise CloudError(f"{called}: expected points of shape (n, 3), got something else: {error}") from error
+        said = one_line(error)[:200]
+        raise CloudError(f"{called}: expected points of shape (n, 3), got something else: {said}") from error
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         hint = "; is this a 2-D export?" if xyz.shape[1:] == (2,) else ""
         raise CloudError(f"{called}: expected points of shape (n, 3), got {xyz.shape}{hint}")
@@ -121,34 +178,25 @@ def from_points(
     if n_dropped == len(xyz) > 0:
         raise CloudError(f"{called}: none of its {len(xyz)} points is finite; was the scan empty?")
     xyz = xyz[finite]
-    if len(xyz) < MIN_POINTS:
-        raise CloudError(
-            f"{called}: found {len(xyz)} points, at least {MIN_POINTS} are needed to fit; is this the whole cloud?"
-        )
-    if (xyz == xyz[0]).all():
+    if len(xyz) >= MIN_POINTS and (xyz == xyz[0]).all():
         raise CloudError(f"{called}: all {len(xyz)} points are equal; was it exported with too few digits?")
-    across = size_cm(xyz)
-    if not math.isfinite(across):
+    if not math.isfinite(size_cm(xyz)):
         reach = f"{np.abs(xyz).max():.3g}"
         raise CloudError(f"{called}: coordinates reach {reach}, expected a plant's size; is the file damaged?")
-    unit = checked_unit(called, units, across, plausible_cm)
-    xyz *= SCALE_CM[unit]
-    offset = np.floor(xyz.min(axis=0)) if np.abs(xyz).max() > FAR_CM else np.zeros(3)
-    cloud = PointCloud(
-        points=xyz - offset,
-        labels=None if labels is None else _whole_labels(called, _matching(called, "labels", labels, finite)),
-        normals=None if normals is None else _known(_matching(called, "normals", normals, finite)),
-        colors=None if colors is None else _uint8(_matching(called, "colors", colors, finite)),
-        name=name,
-        source=source,
-        unit=unit,
-        offset=offset,
-    )
-    if not n_dropped:
-        return cloud
-    note = f"{n_dropped} non-finite point{'s' if n_dropped > 1 else ''} dropped"
-    warnings.warn(f"{called}: {note}", UserWarning, stacklevel=2)
-    return cloud.with_note(note)
+    notes = (f"{n_dropped} non-finite point{'s' if n_dropped > 1 else ''} dropped",) if n_dropped else ()
+    return xyz, finite, notes
+
+
+def _few_digits(called: str, xyz: NDArray[np.float64], step: NDArray[np.float64], unit: str) -> str:
+    """A note on coordinates in coarse steps; CloudError if they leave too few places."""
+    n_places = len(np.unique(xyz, axis=0))
+    is_single = bool((xyz.astype(np.float32) == xyz).all()) and np.abs(xyz).max() > FAR_STEPS * step.max()
+    steps = f"coordinates are in steps of {step.max():.3g} {'' if unit == 'none' else unit}".strip()
+    cause = " (map coordinates in single precision)" if is_single else ""
+    advice = "subtract an offset before the export, or write doubles" if is_single else "export it with more digits"
+    if n_places < MIN_POINTS:
+        raise CloudError(f"{called}: {steps}{cause}, which leaves {n_places} places for {len(xyz)} points; {advice}")
+    return f"{steps}{cause}: digits are missing; {advice}"
 
 
 def _matching(called: str, what: str, array: ArrayLike, finite: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -162,12 +210,18 @@ def _matching(called: str, what: str, array: ArrayLike, finite: NDArray[np.bool_
     return rows[finite]
 
 
-def _whole_labels(called: str, labels: NDArray[np.float64]) -> NDArray[np.int64]:
+def _whole_labels(called: str, labels: NDArray[np.float64], name: str | None) -> tuple[NDArray[np.int64], str]:
+    """Labels as whole numbers, 0 where there is none, and a note on them."""
+    missing = np.isnan(labels)
+    labels = np.where(missing, 0.0, labels)
     bad = labels[~((labels == np.rint(labels)) & (np.abs(labels) < 2**31))]
+    of_property = f" of property '{one_line(name)}'" if name else ""
     if len(bad):
         expected = "whole numbers (0 unknown, 1 stem, 2.. leaves)"
-        raise CloudError(f"{called}: found the label {bad[0]:g}, expected {expected}")
-    return labels.astype(np.int64)
+        raise CloudError(f"{called}: found the label {bad[0]:g}{of_property}, expected {expected}")
+    n_known = int(np.count_nonzero(labels))
+    note = f"labels{of_property or ' given'} (1 stem, 2.. leaves): {n_known} of {len(labels)} points"
+    return labels.astype(np.int64), note
 
 
 def _known(normals: NDArray[np.float64]) -> NDArray[np.float64]:

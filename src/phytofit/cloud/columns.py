@@ -1,61 +1,263 @@
-"""Text in columns: XYZ, TXT, CSV, PTS, ASC."""
+"""Text in columns: XYZ, TXT, CSV, PTS, ASC, whatever parts the columns, marks decimals and names them."""
 
+import csv
 import io
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
-from phytofit.cloud.table import COLOR, NORMAL, XYZ, FileError, Table, key_of
+from phytofit.cloud.encoding import decoded
+from phytofit.cloud.numerals import MISSING, is_number, plain_nan
+from phytofit.cloud.table import COLOR, NORMAL, XYZ, FileError, Table, keys_of, listed, names_points, quoted
 
 __all__ = ["read"]
 
+LINE = re.compile(r"^[ \t]*(?=\S).*", re.MULTILINE)
+COMMENT = re.compile(r"^[ \t]*(?:#|//|%).*", re.MULTILINE)
+COUNT = re.compile(r"^[ \t]*(\d{1,18})[ \t;,]*$", re.MULTILINE)
+SEPARATOR_LINE = re.compile(r'"?sep=.?"?', re.IGNORECASE)  # the first line of some spreadsheets' exports
+DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", re.ASCII)
+QUOTED_COMMA = re.compile(r'"([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)"', re.ASCII)
+IN_BRACKETS = re.compile(r"[\[(][^\])]*[\])]")
+UNIT = re.compile(r"\bx(?:\s*[\[(]\s*(mm|cm|m)\s*[\])]|_(mm|cm|m)\b)", re.IGNORECASE)
+MOST_COLUMNS = 1000
+
+
+class _Head(NamedTuple):
+    """What stands above the rows."""
+
+    names: str | None  # the line that names x, y and z
+    is_comment: bool  # whether that line is one
+    counts: list[int]  # of points, as PTS and CloudCompare write them
+    title: str | None  # the last line that is none of these
+    start: int  # of the rows, in the text
+
 
 def read(data: bytes, wanted: Collection[str]) -> Table:
-    if b"\0" in data:
+    """The columns of a text file; without names they are x, y, z, and those that only colours or normals can be."""
+    text = decoded(data)
+    if "\0" in text:
         raise FileError("holds binary data, expected text with x y z on each line; is the suffix right?")
-    data = data.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    row = re.compile(rb"^[ \t]*(?!#|//)(?=\S).*", re.MULTILINE)
-    first, n_points = row.search(data), None
-    if first and re.fullmatch(rb"\s*\d{1,18}\s*", first[0]) and (second := row.search(data, first.end())):
-        first, n_points = second, int(first[0])  # PTS
-    if first is None:
-        raise FileError("holds no rows, expected x y z on each line; was the export interrupted?")
-    separator = next((mark for mark in ";," if mark.encode() in first[0]), None)
-    words = [word.strip(" \t\"'") for word in first[0].decode("latin-1").split(separator)]
-    if len(words) < 3:
-        raise FileError(f"expected at least 3 columns (x y z), found {len(words)}; is this a 2-D export?")
-    if len(words) > 1000:
-        raise FileError(f"expected columns x y z and a few more, found {len(words)}; is it a table of points?")
-    names, start = words, first.end()
-    if all(re.fullmatch(r"(?i)[-+.\de]+|[-+]?(nan|inf)", word) for word in words):
-        names, start = [], first.start()
-    frame = pd.read_csv(
-        io.BytesIO(re.sub(rb"^[ \t]*(#|//).*", b"", data[start:], flags=re.MULTILINE)),
-        sep=separator or r"\s+",
-        header=None,
-        dtype={i: np.float64 if not names or key_of(names[i]) in wanted else str for i in range(len(words))},
-        encoding="latin-1",
-        skipinitialspace=True,
+    head = _head(text)
+    separator, body = _with_decimal_points(plain_nan(COMMENT.sub("", text[head.start :])))
+    n_most = _n_columns(body, separator)
+    body = _without_trailing(body, separator)
+    n_columns = _n_columns(body, separator)
+    _check_columns(n_columns, n_most, head)
+    names = _names(head, separator, n_columns, n_most)
+    is_pts, body, notes = _without_counts(body, head.counts)
+    if head.names and not head.is_comment:
+        body = re.sub(
+            rf"^[ \t]*{re.escape(head.names)}[ \t]*$", "", body, flags=re.MULTILINE
+        )  # files joined end to end
+    rows = _Rows(body, separator, names or [str(i + 1) for i in range(n_columns)], 1 + text.count("\n", 0, head.start))
+    if names is None:
+        values = rows.parsed({i for i, word in enumerate(rows.first()) if is_number(word)})
+        names, unnamed = _guessed_names(values, n_columns, is_pts=is_pts)
+        notes += unnamed
+    else:
+        values = rows.parsed({i for i, name in enumerate(names) if keys_of(name) & {*wanted}})
+    unit = UNIT.search(head.names or "")
+    return Table(
+        [(name, values[i]) for i, name in enumerate(names) if i in values],
+        names,
+        unit=(unit[1] or unit[2]).lower() if unit else None,
+        notes=notes,
     )
-    names = names or _guessed_names(frame, n_points is not None)
-    if len(names) != frame.shape[1]:
-        raise FileError(f"found {len(names)} column names over {frame.shape[1]} columns; name each column")
-    if n_points not in (None, len(frame)):
-        raise FileError(f"truncated: its first line declares {n_points} points, found {len(frame)}")
-    return Table({name: frame[i].to_numpy() for i, name in enumerate(names) if key_of(name) in wanted}, names)
 
 
-def _guessed_names(frame: pd.DataFrame, is_pts: bool) -> list[str]:
-    values = frame.iloc[:, 3:].to_numpy()
-    values = values[np.isfinite(values)]
-    is_whole = (values == np.rint(values)).all()
-    is_color = is_whole and ((values >= 0) & (values <= 255)).all()
-    more = {3: (), 4: ("label",) if is_whole else ("intensity",), 6: COLOR if is_color else NORMAL}
-    if is_pts:
-        more |= {4: ("intensity",), 7: ("intensity", *COLOR)}
-    if (n := frame.shape[1]) not in more:
-        expected = "3 (x y z), 4 (and label) or 6 (and red green blue, or nx ny nz)"
-        raise FileError(f"found {n} columns without names, expected {expected}; name them in the first line")
-    return [*XYZ, *more[n]]
+def _n_columns(body: str, separator: str | None) -> int:
+    row = LINE.search(body)
+    return len(_words(row[0], separator)) if row else 0
+
+
+def _check_columns(n_columns: int, n_most: int, head: _Head) -> None:
+    if n_most > MOST_COLUMNS:
+        raise FileError(f"expected columns x y z and a few more, found {n_most}; is it a table of points?")
+    if n_columns == 0 and not head.counts:
+        what = f"found {quoted(head.title)}" if head.title else "was the export interrupted?"
+        raise FileError(f"holds no rows, expected x y z on each line; {what}")
+    if n_columns < 3:
+        raise FileError(f"expected at least 3 columns (x y z), found {n_columns or 1}; is this a 2-D export?")
+
+
+def _head(text: str) -> _Head:
+    names, is_comment, title, counts = None, True, None, list[int]()
+    for line in LINE.finditer(text):
+        content = line[0].strip()
+        if COMMENT.match(content):
+            content = content.lstrip("#/% \t")
+            names = content if is_comment and _names_points(content) else names
+        elif SEPARATOR_LINE.fullmatch(content):
+            pass
+        elif count := COUNT.fullmatch(content):
+            counts.append(int(count[1]))
+        elif not is_comment or all(
+            is_number(word) for word in re.split(r"[;,\s]+", content.replace('"', ""), maxsplit=3)[:3]
+        ):
+            return _Head(names, is_comment, counts, title, line.start())
+        elif _names_points(content):
+            names, is_comment = content, False
+        else:
+            title = content
+    return _Head(names, is_comment, counts, title, len(text))
+
+
+def _names_points(line: str) -> bool:
+    return {"x", "y", "z"} <= {*line.lower()} and any(
+        names_points(_words(line, mark)) for mark in (";", ",", "\t", None)
+    )
+
+
+def _words(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        words = re.findall(r'"[^"]*"|\S+', line)
+    else:
+        words = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    return [word.strip(" \t\"'") for word in words]
+
+
+def _with_decimal_points(body: str) -> tuple[str | None, str]:
+    """What parts the columns, None for blanks, and the rows with points for decimal commas."""
+    body = QUOTED_COMMA.sub(r'"\1.\2"', body)
+    first = LINE.search(body)
+    with_comma = re.search(r"^.*,.*", body, re.MULTILINE)
+    if first is None or ";" in first[0]:
+        return ";", body.replace(",", ".")
+    if with_comma is None:
+        return _blank(body, first[0]), body
+    words = with_comma[0].split()
+    if len(words) < 3:
+        return ",", body
+    if all(DECIMAL_COMMA.fullmatch(word) for word in words if "," in word):
+        return _blank(body, first[0]), body.replace(",", ".")
+    cells = [word.removesuffix(",") for word in words]
+    decimals = [cell for cell in cells if "," in cell]
+    if decimals and cells[:-1] == [word[:-1] for word in words[:-1]] and all(map(DECIMAL_COMMA.fullmatch, decimals)):
+        return ";", re.sub(r",(?=[ \t]|$)", ";", body, flags=re.MULTILINE).replace(",", ".")
+    return ",", body
+
+
+def _blank(body: str, row: str) -> str | None:
+    """A tab where each row has as many, so that a cell may be empty or hold blanks; else any blanks."""
+    cells = row.split("\t")
+    if len(cells) < 3 or any(len(cell.split()) > 1 and all(map(is_number, cell.split())) for cell in cells):
+        return None
+    is_regular = body.count("\t") == (len(cells) - 1) * sum(bool(line.strip()) for line in body.split("\n"))
+    return "\t" if is_regular else None
+
+
+def _without_trailing(body: str, separator: str | None) -> str:
+    marks = f"[ \t{separator or ''}]"
+    return re.sub(f"(?<!{marks}){marks}+$|^{marks}+$", "", body, flags=re.MULTILINE)
+
+
+def _names(head: _Head, separator: str | None, n_least: int, n_most: int) -> list[str] | None:
+    """The names of so many columns; None if there are none.
+
+    FileError if a row of names does not fit.  A comment that does not is only a comment.
+    """
+    for line in (head.names, IN_BRACKETS.sub("", head.names)) if head.names else ():
+        for mark in (separator, ";", ",", "\t", None):
+            words = _words(line, mark)
+            n_named = max((i + 1 for i, word in enumerate(words) if word), default=0)
+            if n_named <= n_most and n_least <= len(words) and names_points(words):
+                return words[: max(n_named, n_least)]
+    if head.names and not head.is_comment:
+        n_named = len(_words(head.names, separator))
+        raise FileError(f"found {n_named} column names over {n_least} columns; name each column")
+    titles = _words(head.title or "", separator)
+    if head.names is None and n_least <= len(titles) <= n_most:
+        raise FileError(f"no property x, y, z, found {listed(titles)}; name them so")
+    return None
+
+
+def _without_counts(body: str, counts: Sequence[int]) -> tuple[bool, str, tuple[str, ...]]:
+    """Whether rows are counted, as in PTS, where each scan begins with its count; the rows without; what to say."""
+    marks = list(COUNT.finditer(body))
+    if not marks and not counts:
+        return False, body, ()
+    starts, ends = [0, *(mark.end() for mark in marks)], [*(mark.start() for mark in marks), len(body)]
+    found = [len(LINE.findall(body, start, end)) for start, end in zip(starts, ends, strict=True)]
+    n_scans = sum(n > 0 for n in found)
+    declared = [(count, found[0]) for count in counts]
+    declared += [(int(mark[1]), n) for mark, n in zip(marks, found[1:], strict=True)]
+    wrong = next((pair for pair in declared if pair[0] not in (pair[1], sum(found), n_scans)), None)
+    notes: tuple[str, ...] = (f"{n_scans} scans, read as one cloud",) if n_scans > 1 else ()
+    if wrong is not None:
+        notes += (f"the file declares {wrong[0]} points and holds {wrong[1]}: is it whole?",)
+    return True, COUNT.sub("", body), notes
+
+
+class _Rows(NamedTuple):
+    """Rows of as many columns as there are names, and the first one's line in the file."""
+
+    body: str
+    separator: str | None
+    names: list[str]
+    first_line: int
+
+    def first(self) -> list[str]:
+        """The words of the first row."""
+        row = LINE.search(self.body)
+        return _words(row[0], self.separator) if row else []
+
+    def parsed(self, of_numbers: Collection[int]) -> dict[int, NDArray[np.float64]]:
+        """The columns of numbers, by their place; NaN where a row has none."""
+        width = (self.separator or " ").join("0" * len(self.names))  # the first line says how many columns there are
+        try:
+            frame = pd.read_csv(
+                io.StringIO(f"{width}\n{self.body}"),
+                sep=self.separator or r"\s+",
+                header=None,
+                dtype={i: np.float64 if i in of_numbers else str for i in range(len(self.names))},
+                skipinitialspace=True,
+                na_values=[*MISSING],
+            )
+        except ValueError:
+            self._check(of_numbers)
+            raise
+        return {i: frame[i].to_numpy()[1:] for i in of_numbers}
+
+    def _check(self, of_numbers: Collection[int]) -> None:
+        """Raise FileError for the first row that is too long, and the first word that is no number."""
+        for line, row in enumerate(self.body.split("\n"), self.first_line):
+            words = _words(row, self.separator)
+            if len(words) > len(self.names):
+                raise FileError(f"line {line} has {len(words)} columns, expected {len(self.names)}; export it again")
+            for i, word in enumerate(words):
+                if i in of_numbers and not is_number(word) and word.lower() not in MISSING:
+                    column = quoted(self.names[i])
+                    raise FileError(f"line {line} holds {quoted(word)} in column {column}, expected a number")
+
+
+def _guessed_names(
+    values: dict[int, NDArray[np.float64]], n_columns: int, *, is_pts: bool
+) -> tuple[list[str], tuple[str, ...]]:
+    """Names of columns that have none, by what they hold, and what to say of it; their numbers where it is not clear.
+
+    Whole numbers may be labels, intensities, or anything: they are never taken for labels.
+    """
+    n = len(values[0])
+    at = int(n_columns > 3 and any(np.array_equal(values[0], np.arange(n) + first) for first in (0, 1)))
+    names = [str(i + 1) for i in range(n_columns)]
+    names[at : at + 3] = XYZ
+    notes: tuple[str, ...] = ("column 1 numbers the rows: x y z are columns 2 to 4",) if at else ()
+    more = [values[i][np.isfinite(values[i])] for i in range(at + 3, n_columns) if i in values]
+    is_color = [bool((v == np.rint(v)).all() and (v >= 0).all() and (v <= 255).all()) for v in more[-3:]]
+    is_known = len(more) == 4 and all(is_color)
+    if len(more) in (3, 4) and all(is_color):
+        names[-3:] = COLOR
+    elif len(more) == 3 and all((np.abs(v) <= 1).all() for v in more):
+        names[-3:] = NORMAL
+    unnamed = [name for name in names[at + 3 :] if name.isdigit()]
+    if unnamed and not is_known and not (is_pts and len(unnamed) == 1):
+        which = (
+            f"column {unnamed[0]} has no name" if len(unnamed) == 1 else f"columns {', '.join(unnamed)} have no names"
+        )
+        notes += (f"{which}: not used",)
+    return names, notes

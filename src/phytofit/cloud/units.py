@@ -9,7 +9,7 @@ SCALE_CM = {"cm": 1.0, "mm": 0.1, "m": 100.0, "none": 1.0}  # centimetres per un
 
 def checked_unit(called: str, units: str | None, across: float, plausible_cm: tuple[float, float]) -> str:
     sizes = {unit: across * SCALE_CM[unit] for unit in ("cm", "mm", "m")}
-    ask = "say --units cm, mm or m (none: relative lengths)"
+    ask = "state its unit: mm, cm, m, or none for relative lengths"
     if units is None:
         raise UnitError(
             f"{called}: no unit given; the cloud is {_length(sizes['cm'])} cm across if in cm, "
@@ -21,11 +21,11 @@ def checked_unit(called: str, units: str | None, across: float, plausible_cm: tu
     if units == "none" or low <= sizes[units] <= high:
         return units
     fits = [unit for unit, size in sizes.items() if low <= size <= high]
-    advice = "; ".join(f"if in {unit} it is {_length(sizes[unit])} cm: say --units {unit}" for unit in fits)
+    advice = "; ".join(f"if in {unit} it is {_length(sizes[unit])} cm" for unit in fits)
     advice = advice or "no other unit fits either; is it one plant, without stray points?"
     raise UnitError(
         f"{called}: the cloud is {_length(sizes[units])} cm across if in {units}, "
-        f"expected {low:g} to {high:g} cm; {advice} (none: relative lengths)"
+        f"expected {low:g} to {high:g} cm; {advice}; state its unit: mm, cm, m, or none for relative lengths"
     )
 
 

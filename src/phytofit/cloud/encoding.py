@@ -1,0 +1,66 @@
+"""Bytes as they come from spreadsheets, shells and other systems, on their way to a reader."""
+
+import codecs
+import re
+
+from phytofit.cloud.table import FileError
+
+__all__ = ["content_fault", "decoded", "in_utf8"]
+
+MARKS = (
+    (codecs.BOM_UTF8, "utf-8"),
+    (codecs.BOM_UTF32_LE, "utf-32-le"),  # before UTF-16, whose mark it begins with
+    (codecs.BOM_UTF32_BE, "utf-32-be"),
+    (codecs.BOM_UTF16_LE, "utf-16-le"),
+    (codecs.BOM_UTF16_BE, "utf-16-be"),
+)
+UNMARKED = ((re.compile(rb"(?:[\t\n\r -~]\0){4}"), "utf-16-le"), (re.compile(rb"(?:\0[\t\n\r -~]){4}"), "utf-16-be"))
+CONTENTS = (  # what a file is whose first bytes are these, and the suffixes that it may have, if it is a cloud
+    (rb"\x00\x05\x16\x07", "a macOS resource file that lies beside the cloud, not a cloud; leave it out", ()),
+    (rb"ply[ \t]*[\r\n]", "PLY", (".ply",)),
+    (rb"LASF", "LAS", (".las", ".laz")),
+    (rb"ASTM-E57", "E57", (".e57",)),
+    (rb"# \.PCD", "PCD", (".pcd",)),
+    (rb"PK\x03\x04|\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf|Rar!", "an archive; unpack it first", ()),
+    (rb"%PDF|\x89PNG|\xff\xd8\xff|II\*\x00|MM\x00\*|GIF8", "a document or an image, not a cloud", ()),
+    (rb"\s*<(?:!doctype|html|\?xml)", "a web page or XML, not a cloud; was it downloaded as the file itself?", ()),
+    (rb"version https://git-lfs", "a Git LFS pointer; fetch the file itself with 'git lfs pull'", ()),
+)
+
+
+def in_utf8(data: bytes) -> bytes:
+    """The bytes, as UTF-8 without a mark if they are text that is marked or was written as UTF-16."""
+    encoding = next((name for mark, name in MARKS if data.startswith(mark)), None)
+    encoding = encoding or next((name for start, name in UNMARKED if start.match(data)), None)
+    if encoding is None:
+        return data
+    if encoding == "utf-8":
+        return data.removeprefix(codecs.BOM_UTF8)
+    try:
+        return data.decode(encoding).removeprefix("\ufeff").encode()
+    except UnicodeError as error:
+        raise FileError(
+            f"truncated or damaged: it starts as {encoding.upper()}, and goes on as something else"
+        ) from error
+
+
+def decoded(data: bytes) -> str:
+    """Text with ``\\n`` at the ends of its lines; what is not UTF-8 is taken for Windows-1252, then Latin-1."""
+    text = ""
+    for encoding in ("utf-8", "cp1252", "latin-1"):
+        try:
+            text = data.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+        break
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def content_fault(data: bytes, suffix: str) -> str | None:
+    """What is wrong with a file whose content is not what its suffix says; None if nothing is."""
+    for start, what, suffixes in CONTENTS:
+        if re.match(start, data[:100], re.IGNORECASE):
+            if not suffixes:
+                return f"is {what}"
+            return None if suffix in suffixes else f"is {what} by its content; name it {suffixes[0]}"
+    return None

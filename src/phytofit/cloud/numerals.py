@@ -1,0 +1,44 @@
+"""Numbers as text: the spellings that occur in files of points, and no others."""
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phytofit.cloud.table import FileError, quoted
+
+__all__ = ["MISSING", "NUMBER", "is_number", "numbers", "plain_nan"]
+
+NUMBER = re.compile(r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?", re.ASCII)
+MISSING = frozenset(("", "-", "--", ".", "na", "n/a", "#n/a", "none", "null", "nil"))
+NOT_FINITE = re.compile(r"[-+]?(?:[qs]?nan(?:\(\w*\))?|inf(?:inity)?|1[.,]#[a-z]+\d*)", re.IGNORECASE)
+NAN_OF_OTHERS = re.compile(r"[-+]?(?:\b[qs]nan\b|\bnan\(\w*\)|\b1[.,]#[a-z]+\d*)", re.IGNORECASE)  # 1.#QNAN, nan(ind)
+
+
+def is_number(word: str) -> bool:
+    """Whether a word is a number, or a spelling of one that is not finite."""
+    return bool(NUMBER.fullmatch(word) or NOT_FINITE.fullmatch(word))
+
+
+def plain_nan(text: str) -> str:
+    """The text with ``nan`` for the spellings of it that only some compilers know."""
+    return NAN_OF_OTHERS.sub("nan", text)
+
+
+def numbers(words: Sequence[bytes]) -> NDArray[np.float64]:
+    """The words as numbers, NaN for what is missing or not finite; FileError for any other word."""
+    try:
+        if not any(b"_" in word for word in words):  # which Python takes for a separator of thousands
+            return np.fromiter(map(float, words), np.float64, len(words))
+    except ValueError:
+        pass
+    return np.array([_number(word.decode("latin-1")) for word in words])
+
+
+def _number(word: str) -> float:
+    if NUMBER.fullmatch(word):
+        return float(word.replace(",", "."))
+    if NOT_FINITE.fullmatch(word) or word.lower() in MISSING:
+        return np.nan
+    raise FileError(f"found {quoted(word)}, expected a number; edited, or damaged?")
