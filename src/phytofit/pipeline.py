@@ -178,7 +178,7 @@ def _segmented(cloud_file: Path, folder: Path, how: Mapping[str, Any], log: _Log
     labels = how["labels"]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # they stand in the cloud's notes
-        cloud = read_cloud(cloud_file, how["units"], label_property=labels or "label", plausible_cm=PLANT_CM)
+        cloud = read_cloud(cloud_file, how["units"], label_property=labels, plausible_cm=PLANT_CM)
     key = _key("segment", [cloud_file], how)
     if _same_but_edited(target, key, "plant.ply"):
         raise InputError(

@@ -52,7 +52,7 @@ def or_exit(call: Any) -> Any:
         raise typer.Exit(2) from None
 
 
-def read_quietly(path: Path, units: str | None, labels: str, **how: Any) -> "PointCloud":
+def read_quietly(path: Path, units: str | None, labels: str | None, **how: Any) -> "PointCloud":
     """The cloud in a file, whose warnings stand in its notes, which are printed."""
     from phytofit.cloud import read_cloud
 

@@ -87,7 +87,9 @@ def fit_command(
             help="Whether the stem may go on above the leaf; without, the paper's six parameters only.",
         ),
     ] = FIT["stem_above"],
-    labels: Annotated[str, typer.Option(help="Name of the label property (1 stem, 2.. leaves).")] = "label",
+    labels: Annotated[
+        str, typer.Option(help="Name of the label property (1 stem, 2.. leaves); none: use no labels.")
+    ] = "label",
     seed: Seed = FIT["seed"],
     threads: ThreadsOption = None,
     folder: OutOption = Path("results"),
@@ -134,7 +136,7 @@ def fit_command(
     }
 
     def measured(path: Path, name: str) -> "Fit":
-        cloud = read_quietly(path, units, labels)
+        cloud = read_quietly(path, units, None if labels == "none" else labels)
         result = fit_with_progress(cloud, name, settings)
         save_fit(result, cloud, folder, name, meshes=meshes, convergence=convergence)
         return result

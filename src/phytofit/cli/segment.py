@@ -46,7 +46,7 @@ def segment_command(
 
     def taken_apart(path: Path, name: str) -> "Segmentation":
         with err.status(f"{for_terminal(name)}: looking for stem and leaves"):
-            cloud = read_quietly(path, units, labels or "label", plausible_cm=PLANT_CM)
+            cloud = read_quietly(path, units, labels, plausible_cm=PLANT_CM)
             result = segment(cloud, up=up, labelled=labels is not None)
             save_segmentation(result, folder, name)
             return result

@@ -19,6 +19,7 @@ __all__ = ["MIN_POINTS", "PointCloud", "from_points"]
 
 MIN_POINTS = 100  # fewer can't carry a stem and a leaf
 FAR_CM = 1e6  # coordinates beyond 10 km are map coordinates: their offset is subtracted
+TOO_COARSE = 0.1  # of the cloud's size, in steps of which coordinates show no shape
 FAR_STEPS = 2**22  # steps from the origin, beyond which single precision has no finer ones
 
 
@@ -194,7 +195,7 @@ def _few_digits(called: str, xyz: NDArray[np.float64], step: NDArray[np.float64]
     steps = f"coordinates are in steps of {step.max():.3g} {'' if unit == 'none' else unit}".strip()
     cause = " (map coordinates in single precision)" if is_single else ""
     advice = "subtract an offset before the export, or write doubles" if is_single else "export it with more digits"
-    if n_places < MIN_POINTS:
+    if n_places < MIN_POINTS or step.max() > TOO_COARSE * size_cm(xyz):
         raise CloudError(f"{called}: {steps}{cause}, which leaves {n_places} places for {len(xyz)} points; {advice}")
     return f"{steps}{cause}: digits are missing; {advice}"
 

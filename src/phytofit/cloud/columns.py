@@ -108,7 +108,8 @@ def _head(text: str) -> _Head:
 
 
 def _names_points(line: str) -> bool:
-    return {"x", "y", "z"} <= {*line.lower()} and any(
+    lower = line.lower()
+    return ({"x", "y", "z"} <= {*lower} or "points" in lower) and any(
         names_points(_words(line, mark)) for mark in (";", ",", "\t", None)
     )
 

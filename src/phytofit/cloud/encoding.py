@@ -14,6 +14,7 @@ MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16-le"),
     (codecs.BOM_UTF16_BE, "utf-16-be"),
 )
+OF_TYPESETTERS = dict.fromkeys(map(ord, "\u00a0\u2009\u202f\u3000"), " ") | {ord("\u2212"): "-"}  # blanks and minus
 UNMARKED = ((re.compile(rb"(?:[\t\n\r -~]\0){4}"), "utf-16-le"), (re.compile(rb"(?:\0[\t\n\r -~]){4}"), "utf-16-be"))
 CONTENTS = (  # what a file is whose first bytes are these, and the suffixes that it may have, if it is a cloud
     (rb"\x00\x05\x16\x07", "a macOS resource file that lies beside the cloud, not a cloud; leave it out", ()),
@@ -53,7 +54,8 @@ def decoded(data: bytes) -> str:
         except UnicodeDecodeError:
             continue
         break
-    return text.replace("\r\n", "\n").replace("\r", "\n")
+    plain = text if text.isascii() else text.translate(OF_TYPESETTERS)
+    return plain.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def content_fault(data: bytes, suffix: str) -> str | None:

@@ -10,7 +10,7 @@ import laspy
 import lazrs
 import numpy as np
 
-from phytofit.cloud.table import XYZ, FileError, Table, keys_of
+from phytofit.cloud.table import XYZ, FileError, Table, keys_of, quoted
 
 __all__ = ["read"]
 
@@ -21,7 +21,7 @@ VERSION_OF_LONG_COUNT = (1, 4)  # since which the number of points has a field o
 def read(data: bytes, wanted: Collection[str]) -> Table:
     """The coordinates, in metres, and the dimensions wanted."""
     if not data.startswith(b"LASF"):
-        raise FileError(f"not a LAS file: it starts with {data[:16]!r}, expected 'LASF'")
+        raise FileError(f"not a LAS file: it starts with {quoted(data[:16].decode('latin-1'))}, expected 'LASF'")
     _check_header(data.ljust(375, b"\0"), len(data))
     with laspy.open(io.BytesIO(data), laz_backend=laspy.LazBackend.Lazrs) as file:
         if not _holds_points(data, file.header):

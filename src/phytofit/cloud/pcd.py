@@ -11,7 +11,7 @@ import pypcd4.pypcd4
 from numpy.typing import NDArray
 
 from phytofit.cloud.numerals import numbers
-from phytofit.cloud.table import COLOR, FileError, Table, listed
+from phytofit.cloud.table import COLOR, FileError, Table, listed, quoted
 
 __all__ = ["read"]
 
@@ -31,7 +31,9 @@ def read(data: bytes, wanted: Collection[str]) -> Table:
         data = data.replace(b"\r", b"\n")
     end = re.search(rb"^DATA[ \t]+(\w+)[ \t]*\r?\n", data, re.MULTILINE)
     if end is None:
-        raise FileError(f"not a PCD file, or truncated: starts with {data[:16]!r}, has no line 'DATA'")
+        raise FileError(
+            f"not a PCD file, or truncated: starts with {quoted(data[:16].decode('latin-1'))}, has no line 'DATA'"
+        )
     header = _header(data[: end.start()], end[1].decode().lower())
     columns = (_of_text if header.encoding == "ascii" else _of_bytes)(data[end.end() :], header)
     for _, bits in [pair for pair in columns if pair[0] in ("rgb", "rgba")]:

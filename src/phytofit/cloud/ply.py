@@ -38,7 +38,9 @@ def read(data: bytes, wanted: Collection[str]) -> Table:
     end = re.search(rb"(?:\n|\r)end_header[ \t]*(?:%b|\Z)" % line_end, data)
     if start is None or end is None:
         expected = "a first line 'ply' and a line 'end_header'"
-        raise FileError(f"not a PLY file, or truncated: expected {expected}, it starts with {data[:16]!r}")
+        raise FileError(
+            f"not a PLY file, or truncated: expected {expected}, it starts with {quoted(data[:16].decode('latin-1'))}"
+        )
     is_text, elements = _header(data[: end.start()])
     body, at, found = data[end.end() :], 0, {}
     if is_text:  # read as if it were a binary file of doubles

@@ -78,7 +78,7 @@ def read_cloud(
     except (KeyboardInterrupt, SystemExit):
         raise
     except BaseException as error:  # the libraries raise anything, and a panic in lazrs is not even an Exception
-        said = one_line(error)[:200] or type(error).__name__
+        said = one_line(str(error).strip().partition("\n")[0])[:150] or type(error).__name__
         raise CloudError(f"{called}: can't be read as {path.suffix} ({said}); damaged or misnamed?") from error
     triples = {names: [columns[name] for name in names] for names in (XYZ, NORMAL, COLOR) if columns.keys() >= {*names}}
     stacked = {names: np.stack(arrays, axis=1) for names, arrays in triples.items()}

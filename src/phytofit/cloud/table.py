@@ -49,11 +49,13 @@ class Table(NamedTuple):
     def column(self, wanted: str) -> tuple[str, NDArray[Any]] | None:
         """The column of that name, and what the file calls it; else the one that means the same; else None.
 
-        Raises FileError if several columns that differ could be meant.
+        Of several the first, but FileError if they differ and what is measured depends on them.
         """
         for way in (str, key_of, _key_without_prefix):
             found = [pair for pair in self.columns if way(pair[0]) == way(wanted)]
-            if any(not np.array_equal(found[0][1], values, equal_nan=True) for _, values in found[1:]):
+            if wanted not in (*NORMAL, *COLOR) and any(
+                not np.array_equal(found[0][1], values, equal_nan=True) for _, values in found[1:]
+            ):
                 raise FileError(
                     f"columns {listed(name for name, _ in found)} could all be {wanted}; rename all but one"
                 )
