@@ -5,6 +5,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ from phytofit.refining import (
 from phytofit.species import Species
 from phytofit.tip import gain_of_blunt_end
 
-__all__ = ["DITHER_CM", "estimate"]
+__all__ = ["DITHER_CM", "SCOUTING", "estimate"]
 
 FloatArray = NDArray[np.float64]
 COARSE_POINTS = 700  # that decide which start is the best
@@ -55,6 +56,7 @@ OF_START = (OFFSET, "leaf_base_bend", "leaf_angle")  # beyond its first twentiet
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
 LOWER_ROUNDS = 3
+SCOUTING: dict[str, Any] = {"scout_stride": 4, "tilts_deg": ()}  # of the search: few points, and no leaf from two sides
 LEAST_FACING = 1.0  # concentration, from which a stem was seen from one side: a half of it has 1.6
 
 
@@ -100,8 +102,7 @@ def estimate(
         starts=[_at_junction(mean, pose) for mean, pose in starts],
         n_points=n_points,
         distance=chamfer,
-        scout_stride=4,
-        tilts_deg=(),
+        **SCOUTING,
         seed=seed,
         executor=executor,
     )

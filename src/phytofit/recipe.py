@@ -9,6 +9,7 @@ from phytofit.distances import chamfer, hausdorff, labelled_hausdorff, quantile_
 from phytofit.fitted import Fit
 from phytofit.fitting import METHODS, fit, fit_likelihood, fit_paper
 from phytofit.objectives import PaperObjective
+from phytofit.posterior import SCOUTING, estimate
 from phytofit.reconstruct import reconstruct
 from phytofit.segmentation import segment
 
@@ -28,7 +29,7 @@ STEPS: dict[str, Callable[..., Any]] = {
     "distance_chamfer": chamfer,
     "distance_labels": labelled_hausdorff,
 }
-STEPS_OF = {"likelihood": ("remove_outliers",), "paper": ("remove_outliers", "objective")}  # beside fit
+STEPS_OF = {"likelihood": ("remove_outliers", "search"), "paper": ("remove_outliers", "objective")}  # beside fit
 NOT_SETTINGS = {
     "progress",
     "executor",
@@ -47,20 +48,19 @@ def defaults(function: Callable[..., Any]) -> dict[str, Any]:
 
 
 def recipe() -> dict[str, dict[str, Any]]:
-    """All settings with their defaults: ``{step: {setting: value}}``."""
+    """All settings with their defaults: ``{step: {setting: value}}``; ``search`` is the short one of the likelihood."""
     found = {}
     for step, function in STEPS.items():
         handed_on = HANDED_ON.get(function, BY_METHOD)
         found[step] = {k: v for k, v in defaults(function).items() if k not in NOT_SETTINGS | handed_on}
+    found["search"] = {**found["objective"], **SCOUTING, "n_points": defaults(estimate)["n_points"]}
     return {step: settings for step, settings in found.items() if settings}
 
 
 def recipe_of(result: Fit) -> dict[str, dict[str, Any]]:
     """What made this result, no more: what `fit` was given or chose by itself, and the settings of the steps that its
     method uses."""
-    used = {"species": result.species.name, "seed": result.seed, **result.settings}
     steps = recipe()
-    made = {step: steps[step] for step in STEPS_OF[result.method] if step in steps}
-    if "distance" in used:
-        made |= {step: steps[step] for step in (f"distance_{used['distance']}",) if step in steps}
-    return {"fit": used, **{step: {k: v for k, v in found.items() if k not in used} for step, found in made.items()}}
+    used = {"species": result.species.name, "seed": result.seed, **result.settings}
+    names = [*STEPS_OF[result.method], f"distance_{used.get('distance', 'chamfer')}"]
+    return {"fit": used, **{step: steps[step] for step in names if step in steps}}
