@@ -5,7 +5,7 @@ from pathlib import Path
 
 from evaluation.settings import ROOT
 
-PAGES = (ROOT / "README.md", ROOT / "docs" / "evaluation.md")
+PAGES = (ROOT / "docs" / "accuracy.md", ROOT / "docs" / "evaluation.md")
 
 
 def fill(out: Path, pages: tuple[Path, ...] = PAGES) -> None:
