@@ -27,7 +27,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m evaluation",
         description="Regenerates the paper's tables and figures.  Stopped, it goes on where it was.",
-        epilog="Tables and pictures are written to evaluation/results, and into docs/accuracy.md and docs/evaluation.md.",
+        epilog="Writes tables and pictures to evaluation/results, docs/accuracy.md and docs/evaluation.md.",
     )
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(PARTS)}; all by default")
     parser.add_argument("--full", action="store_true", help="without the limits on peers, ablations and the baseline")

@@ -111,7 +111,7 @@ def test_up_decides_the_direction(made, up):
     assert sign * told.pose[:3, 2] @ made.pose[:3, 2] > 0.9
     leaf_angle = told.parameters["leaf_angle"]
     assert leaf_angle < 90.0 if up == "known" else leaf_angle > 90.0
-    assert any("is the stated up right?" in flag for flag in told.flags) == (up == "upside down")
+    assert any("check up" in flag for flag in told.flags) == (up == "upside down")
 
 
 @pytest.mark.parametrize("method", ["paper", "likelihood"])
@@ -121,10 +121,10 @@ def test_a_straight_level_leaf_is_flagged_since_up_and_down_look_alike(method):
     )
     enough = SMALL | {"n_samples": 300, "n_generations": 8} if method == "paper" else {"threads": 2}
     flagged = phytofit.fit(level.points, "cm", **enough)
-    assert any("up and down" in flag for flag in flagged.flags)
-    assert all(any("up and down" in flag for flag in t.flags) for t in flagged.traits)
+    assert any("which way is up" in flag for flag in flagged.flags)
+    assert all(any("which way is up" in flag for flag in t.flags) for t in flagged.traits)
     told = phytofit.fit(level.points, "cm", up=level.pose[:3, 2], **enough)
-    assert not any("up and down" in flag for flag in told.flags)
+    assert not any("which way is up" in flag for flag in told.flags)
 
 
 def test_the_upside_down_twin_has_the_same_organs():

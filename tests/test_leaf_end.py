@@ -197,7 +197,7 @@ def test_only_a_leaf_that_is_clearly_too_long_is_called_cut_back():
     result = phytofit.fit(made.points, "cm", threads=2)
     for too_long in (True, False):
         cut = replace(result, flags=(), estimate=replace(result.estimate, ends_at=0.9, too_long=too_long))
-        assert any("was cut back by 10 %" in flag for flag in remarked(cut).flags) == too_long
+        assert any("on the last 10 % of the fitted leaf" in flag for flag in remarked(cut).flags) == too_long
 
 
 def test_upside_down_the_leaf_ends_where_it_does():

@@ -173,7 +173,7 @@ def test_six_parameters(made):
 @pytest.mark.parametrize("share", [0.1, 0.3])
 def test_a_missing_tip_is_flagged_and_opens_the_upper_end(made, share):
     cut = without(made, on_leaf(made) & (along(made) > 1.0 - share))
-    assert flagged(cut, "the tip was not seen")
+    assert flagged(cut, "the leaf's tip is missing")
     length = next(t for t in cut.traits if t.name == "leaf_length")
     assert length.high is None
     true = {t.name: t.value for t in phytofit.measure(made.organs)}["leaf_length"]
@@ -216,7 +216,7 @@ def test_much_noise_is_flagged():
 
 def test_a_narrow_leaf_in_much_noise_is_flagged():
     narrow = phytofit.simulate(fixed=GENTLE | {"leaf_width": 0.8}, n_points=N_POINTS, noise_cm=0.5, seed=7)
-    assert flagged(phytofit.fit(narrow.points, "cm", threads=2), "can't be told from the scatter")
+    assert flagged(phytofit.fit(narrow.points, "cm", threads=2), "hardly wider than its points scatter")
 
 
 def bounded(name, **bounds):
@@ -230,14 +230,16 @@ def bounded(name, **bounds):
 
 def test_a_parameter_at_its_bound_is_flagged(made):
     species = bounded("leaf_length", upper=50.0, mean=45.0)
-    assert flagged(phytofit.fit(made.points, "cm", species=species, threads=2), "leaf_length lies at its bound")
+    assert flagged(
+        phytofit.fit(made.points, "cm", species=species, threads=2), "leaf_length is at the limit of the species"
+    )
 
 
 def test_an_angle_of_a_leafs_own_shape_at_its_bound_is_flagged():
     aside = phytofit.simulate(fixed=GENTLE | {"leaf_side_bend": 45.0}, n_points=N_POINTS, noise_cm=0.3, seed=7)
-    flag = "leaf_side_bend lies at its bound, 20 deg"
+    flag = "leaf_side_bend is at the limit of the species, 20 deg: check the unit, or widen the limit in a species file"
     assert flagged(phytofit.fit(aside.points, "cm", species=bounded("leaf_side_bend", upper=20.0), threads=2), flag)
-    assert not flagged(phytofit.fit(aside.points, "cm", threads=2), "lies at its bound")
+    assert not flagged(phytofit.fit(aside.points, "cm", threads=2), "is at the limit")
 
 
 def test_a_cloud_without_noise_is_fitted():
@@ -314,7 +316,7 @@ def test_two_solutions_are_told(result):
         return beside_its_rival(replace(result, estimate=replace(result.estimate, rival=rival))).flags
 
     (flag,) = beside(longer)
-    assert flag.startswith("two solutions are about as probable: leaf_length may be ")
+    assert flag.startswith("two fits are about equally probable: leaf_length may be ")
     assert float(flag.split()[9]) == pytest.approx(values(result)["leaf_length"] + 10.0, abs=0.5)
     assert "stem_diameter" not in flag
     assert beside(result.x) == beside(None) == ()

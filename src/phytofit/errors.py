@@ -37,9 +37,12 @@ class Status(Enum):
     """How a fit ended; the value is the sentence that is shown and stored."""
 
     CONVERGED = "converged: the mean of the last elite is as good as its members"
-    SPLIT_ELITE = "did not converge: the last elite is spread over solutions whose mean is worse than they are"
+    SPLIT_ELITE = (
+        "did not converge: the best candidates of the last generation differ. Use more generations or samples, or "
+        "another seed"
+    )
     AT_REST = "converged: no small change makes the fit more probable"
-    MOVING = "did not converge: the refinement stopped before it came to rest"
+    MOVING = "did not converge: the refinement stopped before it came to rest. Look at fit.png, or try another seed"
 
     @property
     def good(self) -> bool:

@@ -217,4 +217,6 @@ def beside_its_rival(result: Fit) -> Fit:
     ]
     if not differ:
         return result
-    return replace(result, flags=(*result.flags, f"two solutions are about as probable: {', '.join(differ)}"))
+    return replace(
+        result, flags=(*result.flags, f"two fits are about equally probable: {', '.join(differ)}. Look at fit.png")
+    )

@@ -32,8 +32,8 @@ N_SEARCHED = 7  # those and the stem above the leaf
 SEARCH = ("n_samples", "n_generations", "elite_fraction", "covariance_noise")
 DITHERED = f"the points had no noise: {DITHER_CM:g} cm was added, without which the likelihood can't be climbed"
 PLAUSIBLE_LEAD = 4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
-UP_DOUBTFUL = "the leaf leaves the stem downwards or bends up: is the stated up right?"
-UP_UNKNOWN = "up and down can't be told apart by this leaf: the more plausible is given; state up if it is known"
+UP_DOUBTFUL = "with the stated up the leaf points down or bends up: check up"
+UP_UNKNOWN = "this leaf does not show which way is up: leaf angle may be 180° minus this. State up if it is known"
 
 
 def fit(

@@ -38,12 +38,15 @@ RISES = 0.02  # of a leaf's length, which the stem's surface hides and it may be
 IMPLAUSIBLE = 4.0  # spreads of the prior
 BOUNDED = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width", "stem_diameter_above")
 NEAR_BOUND = 1e-6
-TIP_DOUBTFUL = "whether the tip was seen can't be told: the leaf may be longer"
-BEYOND_TIP = "{:.0f} points near the leaf's tip are not explained: the leaf may go on there"
-CUT_BACK = "the fitted leaf was cut back by {:.0f} % to where its points end: {:.0f} more would be expected beyond"
-BLUNT = "the leaf ends bluntly: if its tip was not seen, it is longer"
-ALONG_STEM = "the leaf rises along its stem: its length counts from where it leaves it, and may be {:.2g} {} more"
-TIP_NOT_SEEN = "the tip was not seen: the leaf's length follows from its taper, and may be longer"
+TIP_DOUBTFUL = "the leaf's tip may be missing: leaf length and area may be larger. Look at the tip in fit.png"
+BEYOND_TIP = "{:.0f} points lie beyond the fitted tip: the leaf may be longer. Look at the tip in fit.png"
+CUT_BACK = (
+    "no points on the last {:.0f} % of the fitted leaf, where {:.0f} are expected: leaf length ends where the points "
+    "do. Check the tip in fit.png"
+)
+BLUNT = "the leaf ends bluntly, as if its tip were cut off: leaf length and area are those of the part that was seen"
+ALONG_STEM = "the leaf hugs its stem: leaf length counts from where it leaves the stem, and may be {:.2g} {} more"
+TIP_NOT_SEEN = "the leaf's tip is missing: leaf length and area may be larger. Scan the tip"
 
 
 @dataclass(frozen=True)
@@ -243,32 +246,60 @@ def flags_of(
     if seen.along_stem:
         yield ALONG_STEM.format(seen.along_stem * scale, _length_unit(scale))
     if outlier_share >= LITTLE_EXPLAINED:
-        yield f"the model does not explain {100 * outlier_share:.0f} % of the points"
+        yield (
+            f"the model does not explain {100 * outlier_share:.0f} % of the points: another leaf or clutter may be in "
+            "the cloud. Look at fit.png and cut the cloud more cleanly"
+        )
     for name, std in zip(("stem", "leaf"), noise, strict=False):
         if std > MUCH_NOISE_CM:
             scatter = f"{std * scale:.3g} {_length_unit(scale)}"
-            yield f"the points scatter by {scatter} around the {name}: far more than expected"
+            yield (
+                f"the points scatter by {scatter} around the {name}, far more than expected: check the unit, and the "
+                "fit in fit.png"
+            )
     value = dict(zip(space.names, x.tolist(), strict=True))
     if 0.5 * value["stem_diameter"] < BLURRED * noise[0]:
-        yield "the stem's points scatter by half its radius or more: its diameter is that of a tube, it may be filled"
+        yield (
+            "the stem's points scatter by half its radius or more: stem diameter is too small if the stem's section is "
+            "filled with points"
+        )
     if 0.5 * value["leaf_width"] < EDGE_ON * noise[1]:
-        yield "the leaf's width can't be told from the scatter of its points: was it seen edge-on?"
+        yield (
+            "the leaf is hardly wider than its points scatter, as if seen edge-on: leaf width and area are uncertain. "
+            "Scan across the blade"
+        )
     yield from _against_the_prior(space, x, scale)
 
 
 def _of_what_was_seen(seen: Sighting, own_shape: bool) -> Iterator[str]:
     if not seen.shows_base:
-        yield "the leaf's base is hidden: its angle is read off the rest of the leaf"
+        yield (
+            "the leaf's base is hidden: leaf angle and insertion angle follow from the rest of the leaf. Scan the base"
+        )
     if seen.leaf < 0.5:
-        yield f"only {100 * seen.leaf:.0f} % of the leaf was seen"
+        yield (
+            f"only {100 * seen.leaf:.0f} % of the leaf was seen: the rest of its length, width and area comes from the "
+            "model. Scan from more sides"
+        )
     elif seen.gaps >= MANY_GAPS:
-        yield f"{100 * seen.gaps:.0f} % of the blade has next to no points: its width rests on the rest, and may be off"
+        yield (
+            f"{100 * seen.gaps:.0f} % of the blade has almost no points: leaf width and area come from the rest and "
+            "may be off. Scan from more sides"
+        )
     if seen.leaf_points < FEW_FOR_SHAPE and own_shape:
-        yield f"only {seen.leaf_points:.0f} points tell the leaf's shape: its length may be off by several cm"
+        yield (
+            f"only {seen.leaf_points:.0f} points on the leaf: leaf length may be off by several cm. Scan more densely"
+        )
     if seen.stem_points < FEW_ON_STEM:
-        yield f"only {seen.stem_points:.0f} points on the stem"
+        yield (
+            f"only {seen.stem_points:.0f} points on the stem: stem diameter and leaf angle are uncertain. Keep a "
+            "longer piece of stem"
+        )
     elif seen.sectors < ROUND:
-        yield f"the stem was seen from one side: its diameter rests on {360 * seen.sectors:.0f}° of its circumference"
+        yield (
+            f"the stem was seen from one side ({360 * seen.sectors:.0f}° of its circumference): stem diameter may be "
+            "off. Scan from more sides"
+        )
 
 
 def _against_the_prior(space: ParameterSpace, x: FloatArray, scale: float) -> Iterator[str]:
@@ -277,9 +308,15 @@ def _against_the_prior(space: ParameterSpace, x: FloatArray, scale: float) -> It
         along_stem = p.name == "leaf_angle" and x[i] == p.lower and "leaf_base_bend" in space.names  # as leaves may be
         at_bound = min(x[i] - p.lower, p.upper - x[i]) < NEAR_BOUND and not along_stem
         if at_bound and (p.name in BOUNDED or p.unit == "deg"):  # a share may be 0 or 1; no angle is the greatest
-            yield f"{p.name} lies at its bound, {value:.3g} {unit}"
+            yield (
+                f"{p.name} is at the limit of the species, {value:.3g} {unit}: check the unit, or widen the limit in a "
+                "species file"
+            )
         elif p.name in BOUNDED and abs(x[i] - p.mean) > IMPLAUSIBLE * p.std:
-            yield f"{p.name} is implausible for the species: {value:.3g} {unit}"
+            yield (
+                f"{p.name} of {value:.3g} {unit} is unusual for the species: check the unit, and in fit.png whether "
+                "this is one leaf on its stem"
+            )
 
 
 def _length_unit(scale: float) -> str:

@@ -17,7 +17,9 @@ __all__ = ["Prepared", "prepare"]
 FloatArray = NDArray[np.float64]
 N_LOOKED_AT = 100_000  # points, if they are all kept for the fit, in which the stem is looked for
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
-OTHERS_TOUCH = "other leaves touch this one, or its stem beside it: angle, width and diameter may be off"
+OTHERS_TOUCH = (
+    "other leaves touch this one or its stem: leaf angle, leaf width and stem diameter may be off. Cut them away"
+)
 
 
 @dataclass(frozen=True)
