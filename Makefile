@@ -52,6 +52,7 @@ bench-segment: install
 	$(BIN)/python benchmarks/reconstruct.py
 	$(BIN)/python benchmarks/segment.py --each
 	$(BIN)/python benchmarks/plants.py
+	$(BIN)/python benchmarks/neighbours.py
 
 docs: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'

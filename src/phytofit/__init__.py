@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from phytofit.recipe import recipe
     from phytofit.reconstruct import CAMERAS, Camera, Reconstruction, load_camera, reconstruct
     from phytofit.results import leaf_table, save_fit, save_reconstruction, save_segmentation, trait_table
-    from phytofit.segmentation import Segmentation, SegmentedLeaf, segment
+    from phytofit.segmentation import Segmentation, SegmentedLeaf, segment, separate_plants
     from phytofit.simulation import SimulatedPhytomer, add_noise, add_outliers, occlude, simulate
     from phytofit.species import Species, load_species
     from phytofit.traits import Trait, measure
@@ -113,6 +113,7 @@ __all__ = [
     "save_reconstruction",
     "save_segmentation",
     "segment",
+    "separate_plants",
     "simulate",
     "start_poses",
     "thin",
@@ -149,7 +150,7 @@ MODULES = {  # that are imported when the first of their names is asked for, so 
     "phytofit.recipe": ("recipe",),
     "phytofit.reconstruct": ("CAMERAS", "Camera", "Reconstruction", "load_camera", "reconstruct"),
     "phytofit.results": ("leaf_table", "save_fit", "save_reconstruction", "save_segmentation", "trait_table"),
-    "phytofit.segmentation": ("Segmentation", "SegmentedLeaf", "segment"),
+    "phytofit.segmentation": ("Segmentation", "SegmentedLeaf", "segment", "separate_plants"),
     "phytofit.simulation": ("SimulatedPhytomer", "add_noise", "add_outliers", "occlude", "simulate"),
     "phytofit.species": ("Species", "load_species"),
     "phytofit.traits": ("Trait", "measure"),

@@ -29,7 +29,8 @@ def segment_command(
 
     Writes, for each cloud, DIR/NAME/ with segmentation.png (look at it first), leaves.csv, plant.ply (all points with
     their labels: 0 none, 1 stem, 2.. leaves) and phytomers/leaf_01.ply and on, ready for `phytofit fit`; and
-    DIR/leaves.csv over all. Where a leaf is wrong, edit the labels in plant.ply and give it back with --labels label.
+    DIR/leaves.csv over all. Where a cloud holds several plants, each gets its folder, DIR/NAME/plant_1 and on. Where a
+    leaf is wrong, edit the labels in plant.ply and give it back with --labels label.
 
     Examples:
 
@@ -41,20 +42,30 @@ def segment_command(
     """
     from phytofit.parsing import parse_up
     from phytofit.pipeline import PLANT_CM
-    from phytofit.results import leaf_tables, save_segmentation
-    from phytofit.segmentation import segment
+    from phytofit.results import leaf_tables, save_plants
+    from phytofit.segmentation import segment, separate_plants
 
-    def taken_apart(path: Path, name: str) -> "Segmentation":
+    def taken_apart(path: Path, name: str) -> "list[Segmentation]":
         with err.status(f"{for_terminal(name)}: looking for stem and leaves"):
             cloud = read_quietly(path, units, labels, plausible_cm=PLANT_CM)
-            result = segment(cloud, up=up, labelled=labels is not None)
-            save_segmentation(result, folder, name)
-            return result
+            plants = (cloud,) if labels is not None else separate_plants(cloud, up=up)
+            results = [segment(plant, up=up, labelled=labels is not None) for plant in plants]
+            save_plants(results, folder, name)
+            return results
 
     or_exit(lambda: parse_up(up))
     measure_each(
-        clouds, folder, taken_apart, leaf_tables, _print_leaves, f"plants taken apart: {folder / 'leaves.csv'}"
+        clouds, folder, taken_apart, leaf_tables, _print_plants, f"clouds taken apart: {folder / 'leaves.csv'}"
     )
+
+
+def _print_plants(results: "list[Segmentation]", name: str, where: Path) -> None:
+    if len(results) == 1:
+        _print_leaves(results[0], name, where)
+        return
+    for number, result in enumerate(results, start=1):
+        _print_leaves(result, f"{name}, plant {number}", where / f"plant_{number}")
+    tell(f"Which plant is which: {where / 'plants.png'}")
 
 
 def _print_leaves(result: "Segmentation", name: str, where: Path) -> None:

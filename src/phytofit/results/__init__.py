@@ -9,6 +9,7 @@ from phytofit.results.plant import (
     leaf_table,
     leaf_tables,
     read_segmentation,
+    save_plants,
     save_reconstruction,
     save_segmentation,
 )
@@ -59,6 +60,7 @@ __all__ = [
     "read_table",
     "result_names",
     "save_fit",
+    "save_plants",
     "save_reconstruction",
     "save_segmentation",
     "save_simulated",

@@ -1,6 +1,7 @@
 """What a reconstruction and a segmentation look like on disk: all of it, or nothing."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -11,7 +12,7 @@ import pandas as pd
 
 from phytofit.cloud import read_cloud, write_cloud
 from phytofit.errors import InputError
-from phytofit.plots import plot_reconstruction, plot_segmentation
+from phytofit.plots import plot_plants, plot_reconstruction, plot_segmentation
 from phytofit.reconstruct import Reconstruction
 from phytofit.results.files import files_made, input_of, json_text
 from phytofit.results.replacing import check_made, file_hash, made_in, whole_files, whole_folder
@@ -124,18 +125,40 @@ def save_segmentation(result: Segmentation, folder: str | Path, name: str | None
 
     A folder of that name from an earlier run is replaced.  The clouds are in the input's unit and frame, with labels.
     """
-    name = for_file_name(name or result.cloud.name)
+    return save_plants([result], folder, name)
+
+
+def save_plants(results: Sequence[Segmentation], folder: str | Path, name: str | None = None) -> Path:
+    """Write the plants of one cloud into ``folder/name/``: one as `save_segmentation` does; of several each into
+    plant_1/ and on, with leaves.csv over all and plants.png, which shows which is which."""
+    name = for_file_name(name or results[0].cloud.name)
     with whole_folder(Path(folder), name, "segmentation.json") as part:
-        write_cloud(part / "plant.ply", result.plant)
-        (part / "phytomers").mkdir()
-        for leaf, phytomer in zip(result.leaves, result.phytomers(), strict=True):
-            write_cloud(part / "phytomers" / f"leaf_{leaf.rank:02d}.ply", phytomer)
-        write_table(part / "leaves.csv", leaf_table(name, result))
-        picture = plot_segmentation(result, title=name)
-        picture.savefig(part / "segmentation.png", dpi=150, metadata={"Software": None})
-        said = _segmented(result) | {"files": files_made(part)}
+        if len(results) == 1:
+            _write_segmentation(part, results[0], name, 1)
+            return Path(folder) / name
+        for number, result in enumerate(results, start=1):
+            (part / f"plant_{number}").mkdir()
+            _write_segmentation(part / f"plant_{number}", result, name, number)
+        tables = [leaf_table(name, result, plant=number) for number, result in enumerate(results, start=1)]
+        write_table(part / "leaves.csv", pd.concat(tables))
+        picture = plot_plants(results, title=name)
+        picture.savefig(part / "plants.png", dpi=150, metadata={"Software": None})
+        said = {"phytofit": version("phytofit"), "cloud": one_line(name), "plants": len(results)}
+        said |= {"files": files_made(part)}
         (part / "segmentation.json").write_text(json_text(said), encoding="utf-8", newline="")
     return Path(folder) / name
+
+
+def _write_segmentation(folder: Path, result: Segmentation, name: str, number: int) -> None:
+    write_cloud(folder / "plant.ply", result.plant)
+    (folder / "phytomers").mkdir()
+    for leaf, phytomer in zip(result.leaves, result.phytomers(), strict=True):
+        write_cloud(folder / "phytomers" / f"leaf_{leaf.rank:02d}.ply", phytomer)
+    write_table(folder / "leaves.csv", leaf_table(name, result, plant=number))
+    picture = plot_segmentation(result, title=name)
+    picture.savefig(folder / "segmentation.png", dpi=150, metadata={"Software": None})
+    said = _segmented(result) | {"files": files_made(folder)}
+    (folder / "segmentation.json").write_text(json_text(said), encoding="utf-8", newline="")
 
 
 def leaf_table(name: str, result: Segmentation, *, plant: int = 1) -> pd.DataFrame:

@@ -1,6 +1,7 @@
 """From a plant's cloud to its organs: stem, leaves by rank, phytomers for the fit."""
 
 from phytofit.segmentation.derive import SegmentedLeaf
+from phytofit.segmentation.plants import separate_plants
 from phytofit.segmentation.whole import Segmentation, segment
 
-__all__ = ["Segmentation", "SegmentedLeaf", "segment"]
+__all__ = ["Segmentation", "SegmentedLeaf", "segment", "separate_plants"]

@@ -52,8 +52,11 @@ def coarse(points: FloatArray) -> tuple[IntArray, IntArray]:
     return first, stands_for
 
 
-def plant_graph(points: FloatArray, n_nodes: int) -> PlantGraph:
-    """The graph of points (n, 3), cm: thinned to about `n_nodes`, cleaned, joined; small far pieces left out."""
+def plant_graph(points: FloatArray, n_nodes: int, *, bridged: bool = True) -> PlantGraph:
+    """The graph of points (n, 3), cm: thinned to about `n_nodes`, cleaned, joined; small far pieces left out.
+
+    Where it is not `bridged`, all pieces but the smallest stay, each by itself.
+    """
     kept = thin(points, n_nodes)
     kept = kept[remove_outliers(points[kept])]
     chosen = points[kept]
@@ -75,14 +78,15 @@ def plant_graph(points: FloatArray, n_nodes: int) -> PlantGraph:
     size = np.bincount(piece, minlength=n_pieces)
     large = size >= max(6, LEAST_PIECE * len(chosen))
     large[np.argmax(size)] = True
-    extra = _bridges(chosen, directions, piece, np.flatnonzero(large))
+    none = np.empty(0, np.intp)
+    extra = _bridges(chosen, directions, piece, np.flatnonzero(large)) if bridged else (none, none)
     rows, columns = np.concatenate([rows, extra[0]]), np.concatenate([columns, extra[1]])
     length = np.linalg.norm(chosen[rows] - chosen[columns], axis=1)
     bent = 1.0 - np.abs(np.sum(normals[rows] * normals[columns], axis=1))
     bent[len(rows) - len(extra[0]) :] = 0.0
     graph = _symmetric(rows, columns, length * (1.0 + CREASE * bent), len(chosen))
     joined = connected_components(graph, directed=False)[1]
-    inside = np.flatnonzero(joined == np.bincount(joined).argmax())
+    inside = np.flatnonzero(joined == np.bincount(joined).argmax() if bridged else large[piece])
     graph = csr_array(graph[inside][:, inside])
     return PlantGraph(kept[inside], chosen[inside], normals[inside], graph, spacing, len(extra[0]))
 

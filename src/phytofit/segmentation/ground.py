@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["find_ground"]
+__all__ = ["find_ground", "find_grounds"]
 
 FloatArray = NDArray[np.float64]
 N_LAYERS = 80  # of the cloud's height
@@ -32,6 +32,36 @@ def find_ground(points: FloatArray, up: FloatArray | None) -> tuple[NDArray[np.b
         if ground.sum() > best.sum():
             best, found = ground, direction
     return best, found
+
+
+def find_grounds(points: FloatArray, up: FloatArray | None) -> tuple[NDArray[np.bool_], FloatArray | None]:
+    """As `find_ground`, also where several pots stand in a row, apart or touching."""
+    ground, found = find_ground(points, up)
+    if ground.any():
+        return ground, found
+    for direction in AXES if up is None else up[np.newaxis]:
+        several = np.zeros(len(points), np.bool_)
+        for part in _along_row(points, direction):
+            several[part] |= _ground_along(points[part], direction)
+        if several.sum() > ground.sum():
+            ground, found = several, direction
+    return ground, found
+
+
+def _along_row(points: FloatArray, up: FloatArray) -> list[NDArray[np.intp]]:
+    """The points (n, 3) parted across the row in which what is lowest stands, by pots as long as wide."""
+    height = points @ up
+    low, high = np.quantile(height, [0.002, 0.998])
+    flat = points @ np.linalg.svd(up[np.newaxis])[2][1:].T
+    foot = flat[height < low + (high - low) * LOWEST / N_LAYERS]
+    if len(foot) < LEAST_FOOT:
+        return []
+    rows = np.linalg.eigh(np.cov(foot.T))[1].T  # across the row, along it
+    (left, right), (start, end) = (np.quantile(foot @ row, [0.002, 0.998]) for row in rows)
+    n_pots = round(float((end - start) / max(right - left, 1e-9)))
+    number = np.clip((flat @ rows[1] - start) / max(end - start, 1e-9) * n_pots, 0, n_pots - 1).astype(int)
+    parts = [np.flatnonzero(number == i) for i in range(n_pots)]
+    return [part for part in parts if len(part) >= LEAST_FOOT] if n_pots > 1 else []
 
 
 def _ground_along(points: FloatArray, up: FloatArray) -> NDArray[np.bool_]:

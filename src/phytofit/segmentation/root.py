@@ -4,6 +4,7 @@ From the base, what the leaves share is round and straight, the leaves part from
 of a leaf, the way to the other leaves begins flat, bends, and turns back at the collar; and from the top, leaves rise.
 """
 
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -13,7 +14,7 @@ from phytofit.segmentation.graph import PlantGraph, geodesics, path_to_root, tip
 from phytofit.segmentation.growing import grow
 from phytofit.segmentation.organs import Organs, along_path, find_organs, roundness
 
-__all__ = ["find_root"]
+__all__ = ["Standing", "ends_of", "find_root", "stands_on"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -29,7 +30,30 @@ LEAST_MIDRIB = 4  # nodes of it, to see whether a leaf droops
 PROBE = 0.05  # of that distance: from where to where a direction is measured
 STRAIGHT_WEIGHT = 0.5  # against the others
 HEIGHT_WEIGHT = 3.0  # of how low an end is, where up is known
+LEAST_END = 0.1  # of that distance: what parts from the stem and is shorter is no leaf to count on
 DIRECTIONS = np.array([d for d in product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How a plant stands on one of its ends: how much it looks like a plant there (``alike``), the axis (k, 3) that its
+    stem then has, the stem's radius, cm, how round it is, and its foot (0 flat to 1), the greatest distance over the
+    plant, cm, and how many ends of it are free."""
+
+    alike: float
+    path: FloatArray
+    radius: float
+    roundness: float
+    foot_roundness: float
+    reach: float
+    n_free: int
+
+    @property
+    def rise(self) -> FloatArray:
+        """The direction (3,) from the stem's base to its end."""
+        rise = self.path[-1] - self.path[0]
+        unit: FloatArray = rise / max(float(np.linalg.norm(rise)), 1e-12)
+        return unit
 
 
 def find_root(graph: PlantGraph, up: FloatArray | None) -> int | None:
@@ -37,23 +61,25 @@ def find_root(graph: PlantGraph, up: FloatArray | None) -> int | None:
 
     up : (3,) where it is known; what is high above the lowest nodes is then hardly the base
     """
-    ends = _ends(graph)
+    return next(iter(ends_of(graph, up)), None)
+
+
+def ends_of(graph: PlantGraph, up: FloatArray | None) -> list[int]:
+    """The nodes on which the plant may stand, the likeliest first."""
     low, span = 0.0, 1.0
     height = np.zeros(len(graph.points))
     if up is not None:
         height = graph.points @ up
         low, span = float(height.min()), max(float(np.ptp(height)), 1e-9)
-    likeness = {end: _likeness(graph, end) for end in ends}
-    for path in [path for _, path in likeness.values() if path is not None]:
+    standing = {end: stands_on(graph, end) for end in _ends(graph)}
+    for path in [it.path for it in standing.values() if it is not None]:
         beyond = int(np.argmax(graph.points @ (path[0] - path[-1])))  # where a leaf hides the very end
-        if beyond not in likeness:
-            likeness[beyond] = _likeness(graph, beyond)
+        if beyond not in standing:
+            standing[beyond] = stands_on(graph, beyond)
     score = {
-        end: alike - HEIGHT_WEIGHT * (height[end] - low) / span
-        for end, (alike, path) in likeness.items()
-        if path is not None
+        end: it.alike - HEIGHT_WEIGHT * (height[end] - low) / span for end, it in standing.items() if it is not None
     }
-    return max(score, key=lambda end: score[end], default=None)
+    return sorted(score, key=lambda end: -score[end])
 
 
 def _ends(graph: PlantGraph) -> list[int]:
@@ -74,19 +100,22 @@ def _ends(graph: PlantGraph) -> list[int]:
     return list(dict.fromkeys(ends))
 
 
-def _likeness(graph: PlantGraph, root: int) -> tuple[float, FloatArray | None]:
-    """How much the plant looks like one if it stood on this node, and the axis (k, 3) that its stem then has."""
+def stands_on(graph: PlantGraph, root: int, touches: NDArray[np.bool_] | None = None) -> Standing | None:
+    """How the plant would stand on this node; None if it can't.
+
+    touches : (m,) the nodes that touch another plant; organs that have any are not free, nor are short ones
+    """
     distance, before = geodesics(graph, root)
     organs = find_organs(graph, distance, *grow(graph, distance))
     if organs is None or len(organs.path) < 2:
-        return -np.inf, None
+        return None
     stem = np.flatnonzero(organs.labels == 1)
     foot = stem[distance[stem] < FOOT * float(distance.max())]
     if len(foot) < LEAST_FOOT:  # what the way begins with is so wide that it is a leaf
-        return -np.inf, None
+        return None
     length = float(np.linalg.norm(np.diff(organs.path, axis=0), axis=1).sum())
     straight = float(np.linalg.norm(organs.path[-1] - organs.path[0])) / max(length, 1e-12)
-    round_stem = roundness(graph, distance, foot) + roundness(graph, distance, stem)
+    round_foot, round_stem = roundness(graph, distance, foot), roundness(graph, distance, stem)
     near = distance < AROUND * float(distance.max())
     _, along, place = along_path(graph.points[near], organs.path)
     ahead = place[np.argmax(along)] - organs.path[0]
@@ -94,10 +123,16 @@ def _likeness(graph: PlantGraph, root: int) -> tuple[float, FloatArray | None]:
     before_it = float(((graph.points[near] - graph.points[root]) @ ahead).mean()) / (AROUND * float(distance.max()))
     forward = _forward(graph, distance, before, organs)
     if before_it < LEAST_BEFORE or forward < LEAST_FORWARD:
-        return -np.inf, None
+        return None
     at_end = min(4.0 * before_it, 1.0)  # 1 at the end of a stem, 0 in its middle
     droop = _droop(graph, distance, before, organs)
-    return round_stem + at_end + forward + droop + STRAIGHT_WEIGHT * straight, organs.path
+    alike = round_foot + round_stem + at_end + forward + droop + STRAIGHT_WEIGHT * straight
+    reach = float(distance.max())
+    bound = np.zeros(len(organs.tips) + 2, np.bool_)
+    if touches is not None:
+        bound[organs.labels[touches]] = True
+    long = distance[list(organs.tips)] - np.array(organs.levels) >= LEAST_END * reach
+    return Standing(alike, organs.path, organs.radius, round_stem, round_foot, reach, int((long & ~bound[2:]).sum()))
 
 
 def _forward(graph: PlantGraph, distance: FloatArray, before: IntArray, organs: Organs) -> float:
