@@ -264,7 +264,7 @@ def test_the_command_writes_what_can_be_given_back(five, tmp_path):
     done = CliRunner(env={"COLUMNS": "200", "NO_COLOR": "1"}).invoke(app, [str(a) for a in arguments])
     assert done.exit_code == 1, done.output
     assert "5 leaves" in done.output
-    assert {p.name for p in out.iterdir()} == {"maize", "leaves.csv"}
+    assert {p.name for p in out.iterdir()} == {"maize", "leaves.csv", "failed.csv", "phytofit.log"}
     names = {"plant.ply", "phytomers", "leaves.csv", "segmentation.json", "segmentation.png"}
     assert {p.name for p in (out / "maize").iterdir()} == names
     assert len(list((out / "maize" / "phytomers").iterdir())) == 5

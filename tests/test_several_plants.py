@@ -97,7 +97,13 @@ def test_each_plant_has_its_folder_and_its_rows(tmp_path):
     table = pd.read_csv(tmp_path / "out" / "leaves.csv")
     assert table.groupby("plant")["rank"].apply(list).to_dict() == {1: [1, 2, 3], 2: [1, 2, 3]}
     made = tmp_path / "out" / "bench"
-    assert {path.name for path in made.iterdir()} == {"plant_1", "plant_2", "leaves.csv", "plants.png"}
+    assert {path.name for path in made.iterdir()} == {
+        "plant_1",
+        "plant_2",
+        "leaves.csv",
+        "plants.png",
+        "segmentation.json",
+    }
     back = [phytofit.read_cloud(made / f"plant_{i}" / "plant.ply", "cm") for i in (1, 2)]
     assert [len(cloud) for cloud in back] == [len(part) for part in parts]
     assert [cloud.labels.max() for cloud in back] == [4, 4]

@@ -17,7 +17,7 @@ from phytofit.errors import NoStemError
 from phytofit.parsing import parse_up
 from phytofit.segmentation.graph import PlantGraph, coarse, plant_graph
 from phytofit.segmentation.ground import find_grounds
-from phytofit.segmentation.organs import FLAT
+from phytofit.segmentation.organs import FLAT, along_path
 from phytofit.segmentation.root import Standing, ends_of, stands_on
 
 __all__ = ["separate_plants"]
@@ -29,7 +29,7 @@ N_OF_PIECE = 3000  # of each of those, to see what it stands on
 LEAST_NODES = 50  # of a plant: of fewer it can't be said what is a stem
 SMALLEST = 0.1  # of the tallest plant's: the greatest distance over a plant
 LEAST_ENDS = 2  # leaves, or a leaf and the stem's top, that touch no other plant
-CLUMP = 6.0  # stem radii between the bases, within which shoots are one plant
+CLUMP = 6.0  # stem radii: shoots whose bases or stems are nearer to each other are one plant's
 UPRIGHT = 0.5  # cosine: stems of plants in one cloud point the same way
 HIGHEST_BASE = 0.5  # of the tallest plant's height above its base: bases of others may stand higher, in higher pots
 BELOW = 0.87  # cosine of the angle around straight down, in which nothing carries a plant
@@ -115,8 +115,10 @@ def _of_piece(graph: PlantGraph, up: FloatArray | None) -> list[_Plant]:
         return []
     roots = [alone.base]
     for end in ends:
-        if _may_be_beside(graph, alone, end, roots) and _on(graph, [*roots, end], len(roots)) is not None:
-            roots.append(end)
+        if _may_be_beside(graph, alone, end, roots):
+            beside = _on(graph, [*roots, end], len(roots))
+            if beside is not None and not _share_a_stem(alone, beside):
+                roots.append(end)
     if len(roots) == 1:
         return [alone]
     return [plant for plant in (_on(graph, roots, number) for number in range(len(roots))) if plant is not None]
@@ -131,6 +133,12 @@ def _may_be_beside(graph: PlantGraph, plant: _Plant, end: int, roots: list[int])
     beside = graph.points[end] - graph.points[roots]
     beside = beside - np.outer(beside @ rise, rise)
     return bool(np.linalg.norm(beside, axis=1).min() > CLUMP * plant.standing.radius)
+
+
+def _share_a_stem(one: _Plant, other: _Plant) -> bool:
+    """Whether the stem of one comes so near to the other's that it is the same: reached over a leaf, from its tip."""
+    gap = along_path(other.standing.path, one.standing.path)[0]
+    return bool(gap.min() <= CLUMP * max(one.standing.radius, other.standing.radius))
 
 
 def _on(graph: PlantGraph, roots: list[int], number: int) -> _Plant | None:
