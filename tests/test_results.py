@@ -85,6 +85,12 @@ def test_no_cell_is_a_formula(tmp_path):
     assert kinds["low"].value is None
 
 
+def test_names_that_look_like_numbers_or_nothing_stay_names(tmp_path):
+    names = ["0003", "1e5", "NA", "nan"]
+    write_table(tmp_path / "traits.csv", pd.DataFrame({"cloud": names, "value": [1.0] * 4}))
+    assert read_table(tmp_path / "traits.csv")["cloud"].tolist() == names
+
+
 def test_the_table_over_all_is_of_what_lies_there_now(tmp_path):
     table = FolderTable(tmp_path, "traits.csv", "fit.json", COLUMNS)
 

@@ -27,10 +27,12 @@ img { max-width: 100%; } .note { color: #555; }
 GENERATOR = '<meta name="generator" content="phytofit">'  # says whose page it is
 HEADINGS = ("n", "bias", "RMSE", "MAE", "R", "CCC", "limits of agreement", "covered", "flagged", "outliers")
 MEANING = (
-    "Differences are result minus {measure}. Bias is their mean; RMSE and MAE are their root mean square and mean "
-    "size. R is Pearson's correlation, CCC Lin's concordance. The limits of agreement (Bland and Altman) hold 95 % of "
-    "the differences, if they are normal. Covered: {measure}s within the results' 95 % intervals. Outliers: clouds "
-    "whose difference is far from the others' (modified z-score above 3.5)."
+    "Differences are result minus {measure}. Bias is their mean, RMSE their root mean square, MAE the mean of their "
+    "sizes. R is Pearson's correlation, CCC Lin's concordance correlation, which falls with bias too. The limits of "
+    "agreement (Bland and Altman) hold 95 % of the differences if these are normally distributed. Covered: how many "
+    "{measure}s lie within the result's 95 % interval. An interval with one end only, drawn with an arrow, holds all "
+    "that is beyond it. Flagged: results with a remark that says what to doubt. Outliers: clouds whose difference is "
+    "far from the others' (modified z-score above 3.5)."
 )
 
 
@@ -46,7 +48,7 @@ def agreement_table(found: Sequence[Agreement]) -> pd.DataFrame:
             _number(a.ccc),
             "" if a.n < 2 else f"{a.lower:.2f} to {a.upper:.2f}",
             f"{round(a.coverage * a.n_intervals)} of {a.n_intervals}" if a.n_intervals else "",
-            str(a.flagged),
+            f"{a.flagged} of {a.n}",
             ", ".join(a.outliers),
         )
         for a in found
@@ -63,7 +65,7 @@ def trial_page(
     base: Trial, table: pd.DataFrame, answers: Sequence[str], percent: float, degrees: float, title: str
 ) -> str:
     """One self-contained HTML page: what points and views are needed, and the statistics with the sensor as it is."""
-    parts = ["<ul>", *(f"<li>{for_page(text)}</li>" for text in answers), "</ul>"]
+    parts = _listed("What is needed", answers)
     parts += [_image(plot_trials(table, percent, degrees), "errors by number of points and of views")]
     shown = table.assign(within=(100.0 * table["within"]).round(), coverage=(100.0 * table["coverage"]).round())
     shown = shown.rename(columns={"within": "within, %", "coverage": "covered, %", "rmse": "RMSE"})
@@ -76,16 +78,18 @@ def trial_page(
 def _agreement_parts(
     comparison: Comparison, found: Sequence[Agreement], against: str, measure: str, alone: str
 ) -> list[str]:
-    parts = [_table(agreement_table(found)), f'<p class="note">{for_page(MEANING.format(measure=measure))}</p>']
+    shown = agreement_table(found).rename(index=lambda trait: trait.replace("_", " "))
+    shown = shown if shown["outliers"].any() else shown.drop(columns="outliers")
+    parts = [_table(shown), f'<p class="note">{for_page(MEANING.format(measure=measure))}</p>']
     for a in found:
         those = comparison.pairs[comparison.pairs["trait"] == a.trait]
-        picture = _image(plot_agreement(those, a, against), a.trait)
-        parts += [f"<h2>{for_page(a.trait.replace('_', ' '))}</h2>", picture]
-    if comparison.unmatched:
-        parts.append(f"<h2>{alone}</h2><ul>")
-        parts += [f"<li>{for_page(text)}</li>" for text in comparison.unmatched]
-        parts.append("</ul>")
-    return parts
+        name = a.trait.replace("_", " ")
+        parts += [f"<h2>{for_page(name)}</h2>", _image(plot_agreement(those, a, against), name)]
+    return parts + _listed("Notes", comparison.notes) + _listed(alone, comparison.unmatched)
+
+
+def _listed(heading: str, texts: Sequence[str]) -> list[str]:
+    return [f"<h2>{heading}</h2><ul>", *(f"<li>{for_page(text)}</li>" for text in texts), "</ul>"] if texts else []
 
 
 def _page(title: str, parts: Sequence[str]) -> str:

@@ -123,7 +123,7 @@ def _against_the_hand(results: Path, truth: Path, folder: Path) -> None:
     measures = or_exit(lambda: read_measures(truth))
     comparison = or_exit(lambda: compare(measures, read_results(results)))
     found = agreement(comparison.pairs)
-    for text in comparison.unmatched:
+    for text in (*comparison.notes, *comparison.unmatched):
         note(text)
     if not found:
         complain(f"{truth}: none of its clouds and traits is among those of {results}; are the clouds' names the same?")

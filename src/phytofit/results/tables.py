@@ -45,7 +45,9 @@ def write_table(path: Path, table: pd.DataFrame | str, columns: Sequence[str] = 
 
 def read_table(file: Path | io.StringIO) -> pd.DataFrame:
     """A table that :func:`write_table` wrote, with its units and names as they were."""
-    table = pd.read_csv(file, encoding="utf-8-sig")
+    table = pd.read_csv(  # 0003 and NA are names
+        file, encoding="utf-8-sig", dtype=dict.fromkeys(NAMES, str), keep_default_na=False, na_values=[""]
+    )
     for column in _texts(table):
         table[column] = table[column].map(from_table, na_action="ignore")
     if "unit" in table:
