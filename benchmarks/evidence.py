@@ -154,7 +154,7 @@ def beginnings(leaf: Leaf) -> list[State]:
     feet = [start.pose.copy() for start in leaf.starts]
     for foot, start in zip(feet, leaf.starts, strict=True):
         foot[:3, 3] += start.foot * start.pose[:3, 2]
-    means = [mean_at(start, SPECIES.space) for start in leaf.starts]
+    means = [mean_at(start, SPECIES) for start in leaf.starts]
     stride = max(1, len(leaf.points) // COARSE_POINTS)
     part = leaf._replace(points=leaf.points[::stride], organ=None if leaf.organ is None else leaf.organ[::stride])
     rough = Fitted(part, {}, None, 1.0 / stride)

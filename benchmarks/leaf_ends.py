@@ -33,7 +33,7 @@ def ends_of(leaf: Leaf) -> tuple[float, float] | None:
     feet = [start.pose.copy() for start in leaf.starts]
     for foot, start in zip(feet, leaf.starts, strict=True):
         foot[:3, 3] += start.foot * start.pose[:3, 2]
-    means = [mean_at(start, SPECIES.leading(N_SEARCHED).space) for start in leaf.starts]
+    means = [mean_at(start, SPECIES.leading(N_SEARCHED)) for start in leaf.starts]
     with mock.patch.object(leaf_end, "combined", wraps=leaf_end.combined) as combined:
         estimate(SPECIES, leaf.points, list(zip(means, feet, strict=True)), organ=leaf.organ)
     if not combined.called:

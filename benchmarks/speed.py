@@ -79,7 +79,7 @@ def task_of(points: np.ndarray, n_points: int) -> Task:
     return Task(
         phytofit.Reference.of(found.points),
         [start.pose for start in found.starts],
-        mean_at(found.starts[0], SPECIES.space),
+        mean_at(found.starts[0], SPECIES),
     )
 
 

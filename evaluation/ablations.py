@@ -11,7 +11,7 @@ from scipy.optimize import differential_evolution
 
 import phytofit
 from evaluation.jobs import run_all
-from evaluation.settings import SPECIES, Budget
+from evaluation.settings import PAPERS, Budget
 from evaluation.tables import write_markdown, write_table
 
 FIRST_SEED = 300_000
@@ -45,11 +45,11 @@ def make(budget: Budget, out: Path) -> None:
 
 def ablated(what: str, number: int, settings: dict[str, int]) -> dict[str, Any]:
     """Errors of the traits of a simulated phytomer, 0.5 cm noise, and the Hausdorff distance that was reached."""
-    made = phytofit.simulate(fixed={"stem_length_above": 0.0}, seed=FIRST_SEED + number)
+    made = phytofit.simulate(stem_above="equal", seed=FIRST_SEED + number)
     true = {t.name: t.value for t in phytofit.measure(made.organs)}
     if what in FITS:
         own = FITS[what]
-        others = {} if "method" in own else {"method": "paper", "stem_above": False, **settings}
+        others = {} if "method" in own else {"method": "paper", **settings}
         result = phytofit.fit(made.points, "cm", threads=1, **others, **own)
         traits = result.traits
         reached = result.error if not own.keys() & {"method", "distance"} else np.nan
@@ -64,7 +64,7 @@ def problem_of(
     points: np.ndarray, n_points: int
 ) -> tuple[phytofit.ParameterSpace, np.ndarray, phytofit.PaperObjective]:
     """What is searched: the space of Eq. (1), the mean to start from, and the paper's objective on a cloud (n, 3)."""
-    species = SPECIES.leading(6)
+    species = PAPERS
     found = phytofit.prepare(phytofit.from_points(points, "cm"), species, n_points=n_points)
     objective = phytofit.PaperObjective(
         species.model,
@@ -72,11 +72,11 @@ def problem_of(
         starts=[start.pose for start in found.starts],
         n_points=n_points,
     )
-    return species.space, phytofit.mean_at(found.starts[0], species.space), objective
+    return species.space, phytofit.mean_at(found.starts[0], species), objective
 
 
 def traits_at(objective: phytofit.PaperObjective, x: np.ndarray) -> tuple[list[phytofit.Trait], float]:
-    organs = [organ.row(0) for organ in SPECIES.leading(6).model.organs(x)]
+    organs = [organ.row(0) for organ in PAPERS.model.organs(x)]
     return phytofit.measure(organs), objective.register(x)[1]
 
 

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 import phytofit
 from evaluation.draw import BLACK, outline, save, side_of
 from evaluation.jobs import run_all
-from evaluation.settings import COLORS, NAMES, SPECIES, Budget, clouds, read
+from evaluation.settings import COLORS, NAMES, PAPERS, SPECIES, Budget, clouds, read
 
 SHOWN = ("leaf_length", "leaf_angle")
 
@@ -28,8 +28,9 @@ def make(budget: Budget, out: Path) -> None:
 
 def search(path: Path | None, settings: dict[str, int]) -> dict[str, Any]:
     """The paper's search on a cloud, its model at each generation's mean, and the traits of the default."""
-    cloud = phytofit.from_points(phytofit.simulate(seed=3).points, "cm") if path is None else read(path)
-    species = SPECIES.leading(7)
+    made = phytofit.simulate(stem_above="equal", seed=3)
+    cloud = phytofit.from_points(made.points, "cm") if path is None else read(path)
+    species = PAPERS
     found = phytofit.prepare(cloud, species, n_points=settings["n_points"])
     objective = phytofit.PaperObjective(
         species.model,
@@ -42,7 +43,7 @@ def search(path: Path | None, settings: dict[str, int]) -> dict[str, Any]:
             species.space,
             n_samples=settings["n_samples"],
             n_generations=settings["n_generations"],
-            mean=phytofit.mean_at(found.starts[0], species.space),
+            mean=phytofit.mean_at(found.starts[0], species),
         ),
         objective,
     )
@@ -57,7 +58,7 @@ def search(path: Path | None, settings: dict[str, int]) -> dict[str, Any]:
         "models": models,
         "history": run.history,
         "default": default.parameters,
-        "true": None if path else dict(zip(SPECIES.space.names, phytofit.simulate(seed=3).x.tolist(), strict=True)),
+        "true": None if path else dict(zip(SPECIES.space.names, made.x.tolist(), strict=True)),
     }
 
 

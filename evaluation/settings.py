@@ -10,6 +10,7 @@ ROOT = Path(__file__).parents[1]
 DATA = ROOT / ".." / "shared" / "data" / "sodhi2018"
 UNITS = {"0015_occl1": "mm"}  # of the paper's clouds; cm else
 SPECIES = phytofit.load_species()
+PAPERS = SPECIES.with_stem_above("equal")  # the paper's phytomer: six parameters, the leaf in the middle of its stem
 COLORS = {"likelihood": "#0072B2", "paper": "#D55E00", "without a model": "#7F7F7F", "truth": "#000000"}
 MARKERS = {"likelihood": "o", "paper": "s", "without a model": "^"}
 NAMES = {"likelihood": "phytofit (default)", "paper": "the paper's method", "without a model": "without a model"}

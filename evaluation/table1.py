@@ -12,7 +12,7 @@ import pandas as pd
 import phytofit
 from benchmarks import peers
 from evaluation.jobs import run_all
-from evaluation.settings import SPECIES, Budget
+from evaluation.settings import PAPERS, Budget
 from evaluation.tables import write_markdown, write_table
 
 PAPER = {  # seconds, 8 threads of an Intel i7 at 2.9 GHz: (samples, points)
@@ -49,11 +49,11 @@ def make(budget: Budget, out: Path) -> None:
 def seconds(n_samples: int, n_points: int, n_generations: int, n_candidates: int) -> dict[str, float]:
     """Seconds of a generation: ours, mean of a search's, with all threads and with one; a peer's, one thread, from so
     many candidates, each with 50 rounds of ICP and the Hausdorff distance."""
-    species = SPECIES.leading(7)
+    species = PAPERS
     cloud = phytofit.from_points(phytofit.simulate(n_points=n_points, seed=1).points, "cm")
     found = phytofit.prepare(cloud, species, n_points=n_points)
     starts = [start.pose for start in found.starts]
-    mean = phytofit.mean_at(found.starts[0], species.space)
+    mean = phytofit.mean_at(found.starts[0], species)
     row: dict[str, float] = {
         "samples": n_samples,
         "points": n_points,

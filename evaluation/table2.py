@@ -49,13 +49,12 @@ def make(budget: Budget, out: Path) -> None:
 
 
 def simulated(method: str, number: int, seed: int, settings: dict[str, int]) -> dict[str, Any]:
-    """True and fitted parameters of one of the protocol's phytomers: 5,000 points, 0.5 cm noise, no stem above."""
-    made = phytofit.simulate(fixed={"stem_length_above": 0.0}, seed=FIRST_SEED + number)
+    """True and fitted parameters of one of the protocol's phytomers: 5,000 points, 0.5 cm noise, the leaf in the middle
+    of its stem."""
+    made = phytofit.simulate(stem_above="equal", seed=FIRST_SEED + number)
     truth = {"x": made.x[: len(PARAMETERS)], "true": {t.name: t.value for t in phytofit.measure(made.organs)}}
     try:
-        result = phytofit.fit(
-            made.points, "cm", method=method, stem_above=method != "paper", seed=seed, threads=1, **settings
-        )
+        result = phytofit.fit(made.points, "cm", method=method, seed=seed, threads=1, **settings)
     except phytofit.NoPhytomerError:
         nothing = (np.nan, None, None)
         return truth | {"fitted": np.full(6, np.nan), "traits": dict.fromkeys(truth["true"], nothing), "flags": ()}
@@ -67,7 +66,7 @@ def simulated(method: str, number: int, seed: int, settings: dict[str, int]) -> 
 
 
 def without_model(number: int) -> dict[str, float]:
-    made = phytofit.simulate(fixed={"stem_length_above": 0.0}, seed=FIRST_SEED + number)
+    made = phytofit.simulate(stem_above="equal", seed=FIRST_SEED + number)
     try:
         return model_free.measure(made.points)
     except phytofit.NoPhytomerError:

@@ -139,7 +139,7 @@ def test_the_upside_down_twin_has_the_same_organs():
 
 
 def test_six_parameters_and_random_start_and_labels(made):
-    six = phytofit.fit(made.points, "cm", stem_above=False, **SMALL)
+    six = phytofit.fit(made.points, "cm", stem_above="none", **SMALL)
     assert len(six.x) == 6
     assert "stem_length_above" not in six.parameters
     elsewhere = phytofit.fit(made.points, "cm", random_start=True, **SMALL)

@@ -125,7 +125,7 @@ def test_a_population_is_its_plants_one_by_one(xs):
 
 @given(SHAPES)
 def test_upside_down_is_the_same_plant(x):
-    turn, offset, pose = Phytomer.upside_down(x)
+    turn, offset, pose = Phytomer().upside_down(x)
     twin = turn @ x + offset
     stem, leaf = move(grow(twin), pose)
     expected_stem, expected_leaf = grow(x)
@@ -137,7 +137,7 @@ def test_upside_down_is_the_same_plant(x):
     np.testing.assert_allclose(leaf.frame[:, :, 1:], -expected_leaf.frame[:, :, 1:], atol=ROTATION)  # seen from below
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=EXACT)
     np.testing.assert_allclose(np.linalg.det(pose), 1.0, rtol=EXACT)
-    again, back, pose_back = Phytomer.upside_down(twin)
+    again, back, pose_back = Phytomer().upside_down(twin)
     np.testing.assert_allclose(again @ twin + back, x, atol=1e-9)
     np.testing.assert_allclose(pose @ pose_back, np.eye(4), atol=1e-9)
 
@@ -147,9 +147,9 @@ def test_upside_down_with_any_number_of_parameters(k):
     """As with all of them, and the others neutral."""
     x = X.copy()
     x[7:k] = (0.3 * LOW + 0.7 * HIGH)[7:k]
-    turn, offset, pose = Phytomer.upside_down(x[:k])
+    turn, offset, pose = Phytomer().upside_down(x[:k])
     assert (turn.shape, offset.shape, pose.shape) == ((k, k), (k,), (4, 4))
-    all_turn, all_offset, all_pose = Phytomer.upside_down(x)
+    all_turn, all_offset, all_pose = Phytomer().upside_down(x)
     np.testing.assert_array_equal(turn @ x[:k] + offset, (all_turn @ x + all_offset)[:k])
     np.testing.assert_array_equal(pose, all_pose)
 
@@ -316,9 +316,9 @@ def test_a_stem_never_tapers_to_nothing(taper):
 @given(SHAPES)
 def test_plants_near_one_are_upside_down_near_its_twin(x):
     """To first order: the slopes by differences of the twins themselves."""
-    turn, _, _ = Phytomer.upside_down(x)
+    turn, _, _ = Phytomer().upside_down(x)
     step = 1e-6
     for i in range(len(x)):
         both = [x + sign * step * (np.arange(len(x)) == i) for sign in (1.0, -1.0)]
-        there, back = (turned @ near + offset for near in both for turned, offset, _ in [Phytomer.upside_down(near)])
+        there, back = (turned @ near + offset for near in both for turned, offset, _ in [Phytomer().upside_down(near)])
         np.testing.assert_allclose((there - back) / (2.0 * step), turn[:, i], rtol=1e-4, atol=1e-5)

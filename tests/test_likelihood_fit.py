@@ -162,7 +162,7 @@ def test_correlated_errors_widen_the_intervals(made, result):
 
 def test_six_parameters(made):
     plain = phytofit.simulate(fixed=GENTLE | {"stem_length_above": 0.0}, n_points=N_POINTS, noise_cm=0.3, seed=4)
-    six = phytofit.fit(plain.points, "cm", stem_above=False, threads=2)
+    six = phytofit.fit(plain.points, "cm", stem_above="none", threads=2)
     assert len(six.x) == 6
     assert np.all(np.abs(six.x - plain.x[:6]) < WITHIN_STD * np.sqrt(np.diag(six.covariance)))
 

@@ -2,7 +2,7 @@
 
 import inspect
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -17,7 +17,6 @@ from phytofit.errors import SettingError, Status
 from phytofit.fitted import Fit, beside_its_rival, remarked
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation
-from phytofit.parameters import ParameterSpace
 from phytofit.parsing import parse_points, parse_up
 from phytofit.pose import StartPose
 from phytofit.posterior import DITHER_CM, estimate
@@ -27,10 +26,10 @@ from phytofit.species import Species, load_species
 __all__ = ["METHODS", "fit", "mean_at"]
 
 FloatArray = NDArray[np.float64]
-N_PAPER = 6  # parameters of Eq. (1)
 N_SEARCHED = 7  # those and the stem above the leaf
 SEARCH = ("n_samples", "n_generations", "elite_fraction", "covariance_noise")
 DITHERED = f"the points had no noise: {DITHER_CM:g} cm was added, without which the likelihood can't be climbed"
+LEAST_ALIKE = 0.5  # of the stem's parts above and below a leaf, shorter over longer: half-way from "none" to "equal"
 PLAUSIBLE_LEAD = 4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
 UP_DOUBTFUL = "with the stated up the leaf points down or bends up: check up"
 UP_UNKNOWN = "this leaf does not show which way is up: leaf angle may be 180° minus this. State up if it is known"
@@ -51,7 +50,7 @@ def fit(
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
     random_start: bool = False,
-    stem_above: bool = True,
+    stem_above: str | None = None,
     seed: int = 0,
     threads: int | None = None,
     progress: Callable[[Generation], None] | None = None,
@@ -74,8 +73,10 @@ def fit(
     n_points : to which the cloud is thinned: 10,000 for "likelihood"; 5,000 for "paper", and also of each candidate
     elite_fraction, covariance_noise : see :class:`phytofit.CrossEntropy`
     random_start : start the search from means drawn from the prior (as in Fig. 7d), not from the prior's and, for
-        the stem's lengths, from the start pose
-    stem_above : whether the stem may go on above the leaf; False is the paper's model of six parameters, Eq. (1)
+        the stem's diameter and lengths, from the start pose
+    stem_above : of the stem above the leaf: "equal", as long as below it; "none"; or "free", a parameter of its own.
+        Equal by default for "paper", since so it is in the clouds that the paper's authors simulated; free for
+        "likelihood".  The first two have the paper's six parameters only, Eq. (1), also for "likelihood".
     seed : the same seed gives the same result, with any number of threads
     threads : how many to work with; as many as there are cores by default
     progress : called after each generation with what it left
@@ -100,12 +101,13 @@ def fit(
         raise SettingError(f"units: {cloud.name} was read in {cloud.unit}, got {units!r}; leave units out")
     cloud = cloud.unrounded()
     search: dict[str, Any] = {"elite_fraction": elite_fraction, "covariance_noise": covariance_noise}
-    given = {"n_samples": n_samples, "n_points": n_points, "n_generations": n_generations, "distance": distance}
+    search["random_start"] = random_start
+    given: dict[str, Any] = {"n_samples": n_samples, "n_points": n_points, "n_generations": n_generations}
+    given |= {"distance": distance, "stem_above": stem_above}
     search |= {name: value for name, value in given.items() if value is not None}
     used = {**_defaults(METHODS[method]), **search}
     CrossEntropy(species.space, **{name: value for name, value in used.items() if name in SEARCH})  # checks them
-    if not stem_above:
-        species = species.leading(N_PAPER)
+    species.with_stem_above(used["stem_above"])  # checks it
     one_thread = threadpool_limits(limits=1, user_api="blas")  # more would round sums in another order
     with one_thread, ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
         found = prepare(
@@ -116,11 +118,7 @@ def fit(
             with_outliers=method == "likelihood",
             seed_points=None if seed_points is None else cloud.from_input_frame(seed_points),
         )
-        means = [mean_at(start, species.leading(N_SEARCHED).space) for start in found.starts]
-        if random_start:
-            drawn = CrossEntropy(species.leading(N_SEARCHED).space, n_samples=2, elite_fraction=0.9, seed=seed)
-            means[0] = drawn.ask()[0]  # from the prior, within its bounds (Fig. 7d)
-        result = METHODS[method](found, species, means, seed=seed, executor=executor, progress=progress, **search)
+        result = METHODS[method](found, species, seed=seed, executor=executor, progress=progress, **search)
     pose = found.home @ result.pose
     pose[:3, 3] *= found.scale
     result = replace(
@@ -135,19 +133,16 @@ def fit(
         settings={
             "method": method,
             **used,
-            "random_start": random_start,
-            "stem_above": stem_above,
             "up": None if direction is None else direction.tolist(),
             "seed_point": None if seed_points is None else seed_points.tolist(),
         },
     )
-    return remarked(_right_way_up(beside_its_rival(result), direction))
+    return remarked(_beside_its_stem(_right_way_up(beside_its_rival(result), direction), found))
 
 
 def fit_paper(
     found: Prepared,
     species: Species,
-    means: Sequence[FloatArray],
     *,
     seed: int,
     executor: Executor,
@@ -158,9 +153,11 @@ def fit_paper(
     n_generations: int = 10,
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
+    random_start: bool = False,
+    stem_above: str = "equal",
 ) -> Fit:
     """The paper's method: cross-entropy search for the phytomer whose points, aligned by ICP, lie nearest the cloud."""
-    species = species.leading(len(means[0]))
+    species = species.with_stem_above(stem_above).leading(N_SEARCHED)
     objective = PaperObjective(
         species.model,
         Reference.of(found.points, found.organ),
@@ -176,7 +173,7 @@ def fit_paper(
         n_generations=n_generations,
         elite_fraction=elite_fraction,
         covariance_noise=covariance_noise,
-        mean=means[0],
+        mean=_means(found, species, random_start, seed)[0],
         seed=seed,
     )
     minimise(search, objective, progress)
@@ -199,7 +196,6 @@ def fit_paper(
 def fit_likelihood(
     found: Prepared,
     species: Species,
-    means: Sequence[FloatArray],
     *,
     seed: int,
     executor: Executor,
@@ -209,8 +205,12 @@ def fit_likelihood(
     n_generations: int = 4,
     elite_fraction: float = 0.1,
     covariance_noise: float = 0.5,
+    random_start: bool = False,
+    stem_above: str = "free",
 ) -> Fit:
     """The most probable phytomer of a cloud, thinned to `n_points`: a short cross-entropy search, then refinement."""
+    species = species.with_stem_above(stem_above)
+    means = _means(found, species.leading(N_SEARCHED), random_start, seed)
     most_probable = estimate(
         species,
         found.points,
@@ -244,6 +244,15 @@ def fit_likelihood(
 METHODS: dict[str, Callable[..., Fit]] = {"likelihood": fit_likelihood, "paper": fit_paper}
 
 
+def _means(found: Prepared, species: Species, random_start: bool, seed: int) -> list[FloatArray]:
+    """Parameters (k,) that a search may begin with, for each start pose."""
+    means = [mean_at(start, species) for start in found.starts]
+    if random_start:
+        drawn = CrossEntropy(species.space, n_samples=2, elite_fraction=0.9, seed=seed)
+        means[0] = drawn.ask()[0]  # from the prior, within its bounds (Fig. 7d)
+    return means
+
+
 def _foot_pose(start: StartPose) -> FloatArray:
     """The start with the stem's foot as its origin, as the model has it."""
     pose = start.pose.copy()
@@ -264,12 +273,13 @@ def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
     says where neither is clearly so.
     """
     space = result.species.space
-    if "stem_length_above" not in space.names:
+    found = result.species.model.upside_down(result.x)
+    searched = result.species.model.upside_down(result.x[: len(result.history[0].mean)])
+    if found is None or searched is None:
         return result
-    turn, offset, pose = result.species.model.upside_down(result.x)
+    turn, offset, pose = found
     pose[:3, 3] *= result.scale
-    searched = len(result.history[0].mean)
-    part, shift, _ = result.species.model.upside_down(result.x[:searched])
+    part, shift, _ = searched
     twin = replace(
         result,
         x=turn @ result.x + offset,
@@ -298,12 +308,40 @@ def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
     return better
 
 
-def mean_at(start: StartPose, space: ParameterSpace) -> FloatArray:
-    """The prior's mean, with the stem's lengths as the start pose saw them."""
-    mean = space.mean
-    seen = {"stem_length": -start.foot, "stem_length_above": start.top}
-    if "stem_length_above" not in space.names:
-        seen = {"stem_length": start.top - start.foot}
+def _beside_its_stem(result: Fit, found: Prepared) -> Fit:
+    """The result, with a flag where the cloud's stem, as the start pose saw it, does not end as `stem_above` says."""
+    how = str(result.settings["stem_above"])
+    axis = result.pose[:3, 2]
+    along = [float((found.home @ start.pose)[:3, 2] @ axis) for start in found.starts]
+    best = int(np.argmax(np.abs(along)))
+    below, above = -found.starts[best].foot, found.starts[best].top
+    if along[best] < 0.0:
+        below, above = above, below
+    alike = min(below, above) > LEAST_ALIKE * max(below, above)
+    if how == "free" or alike == (how == "equal"):
+        return result
+    unit = "" if result.relative else " cm"
+    over, under = (f"{length * found.scale:.3g}{unit}" for length in (above, below))
+    text = (
+        f"the stem goes on {over} above the leaf and {under} below it: "
+        f"stem_above={'equal' if alike else 'free'!r} may fit better than {how!r}"
+    )
+    return replace(result, flags=(*result.flags, text))
+
+
+def mean_at(start: StartPose, species: Species) -> FloatArray:
+    """The prior's mean, with the stem's diameter and lengths as the start pose saw them; of a stem that has one length
+    for both sides of the leaf, that which leaves the least at either end.
+
+    Where the leaf lies further off the model than the stem's surface does, the largest distance says nothing of the
+    stem's diameter, and the search leaves it near where it began.
+    """
+    space = species.space
+    mean, seen = space.mean, {"stem_diameter": 2.0 * start.radius}
+    if "stem_length_above" in space.names:
+        seen |= {"stem_length": -start.foot, "stem_length_above": start.top}
+    else:
+        seen["stem_length"] = (start.top - start.foot) / (1.0 + species.model.stem_above)
     for name, value in seen.items():
         i = space.index(name)
         mean[i] = np.clip(value, space.lower[i], space.upper[i])

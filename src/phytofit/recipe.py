@@ -37,7 +37,8 @@ NOT_SETTINGS = {
     "units",
     "starts",
 }  # inputs, and what does not change the result
-BY_METHOD, BY_FIT = {"n_points", "seed", "distance"}, {"seed", "distance"}  # that a method, or fit, hands on
+BY_METHOD = {"n_points", "seed", "distance"}  # that a method hands on
+BY_FIT = {"seed", "distance", "random_start"}  # that fit hands on
 HANDED_ON: dict[Callable[..., Any], set[str]] = {fit: set(), **dict.fromkeys(METHODS.values(), BY_FIT)}
 
 

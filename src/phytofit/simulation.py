@@ -19,6 +19,7 @@ SPARE = 8  # times as many points are drawn as cameras are to see
 SCREEN_POINTS, PIXEL_CM = 250_000, 0.1  # of the depth buffer; some five points a pixel
 BEHIND_CM = 0.4  # so far behind the nearest point of its pixel a point is still of the same surface, seen at a slant
 AT_ONCE = 1000  # points, whose neighbours are listed
+ABOVE = "stem_length_above"
 OUTLIER_MARGIN = 0.25  # outliers fill the cloud's box, grown by this share of its size
 
 
@@ -38,6 +39,7 @@ def simulate(
     species: Species | None = None,
     *,
     fixed: Mapping[str, float] | None = None,
+    stem_above: str = "free",
     n_points: int = 5000,
     noise_cm: float = 0.5,
     noise_reach_cm: float = 0.0,
@@ -51,7 +53,8 @@ def simulate(
     """Draw a phytomer from the species' ranges and scan it.
 
     Defaults are the paper's simulated protocol (section V); `n_spheres` of `sphere_diameter_cm` are its occlusions
-    (Fig. 7).  `fixed` gives parameters by name that are not to be drawn.  `n_points` are drawn before spheres are
+    (Fig. 7).  `fixed` gives parameters by name that are not to be drawn.  The stem above the leaf is drawn
+    too ("free"), as long as that below ("equal"), or "none".  `n_points` are drawn before spheres are
     removed; `outlier_share` of the points that are left is added.  Noise is shared by neighbours as far as
     `noise_reach_cm`, as in fused and stereo clouds, or independent.  `n_views` cameras see the points, evenly
     spaced around the stem and looking down on it by `CAMERA_ABOVE_DEG`; None: from everywhere.
@@ -76,7 +79,8 @@ def simulate(
     low, high = species.ranges.T
     x = low.copy()
     x[low < high] = random.uniform(low[low < high], high[low < high])
-    for name, value in (fixed or {}).items():
+    fixed = {} if fixed is None else fixed
+    for name, value in fixed.items():
         i = space.index(name)
         if not space.lower[i] <= value <= space.upper[i]:
             raise SettingError(
@@ -84,7 +88,12 @@ def simulate(
                 f"got {value:g}"
             )
         x[i] = value
-    organs: tuple[Organ, ...] = tuple(o.row(0) for o in species.model.organs(x))
+    model = species.with_stem_above(stem_above).model
+    if stem_above != "free" and ABOVE in space.names:
+        if ABOVE in fixed:
+            raise SettingError(f"{ABOVE}: expected no value where stem_above is {stem_above!r}, got {fixed[ABOVE]:g}")
+        x[space.index(ABOVE)] = model.stem_above * x[space.index("stem_length")]
+    organs: tuple[Organ, ...] = tuple(o.row(0) for o in model.organs(x))
     n_drawn = n_points if n_views is None else SPARE * n_points
     points, organ = SurfaceSampler(n_drawn, int(random.integers(2**31)), even=False).draw(organs)
     labels = organ.astype(np.int64) + 1

@@ -33,6 +33,7 @@ __all__ = ["fit_command", "fit_with_progress"]
 
 FIT = defaults_of("fitting", "fit")
 DISTANCES = ", ".join(entries_of("distances", "DISTANCES"))
+STEM_ABOVE = "|".join(entries_of("species", "STEM_ABOVE"))
 METHODS = {name: defaults_of("fitting", function) for name, function in entries_of("fitting", "METHODS").items()}
 
 
@@ -81,12 +82,13 @@ def fit_command(
         bool, typer.Option("--random-start", help="Start from means drawn from the prior (Fig. 7d of the paper).")
     ] = FIT["random_start"],
     stem_above: Annotated[
-        bool,
+        str | None,
         typer.Option(
-            "--stem-above/--no-stem-above",
-            help="Whether the stem may go on above the leaf; without, the paper's six parameters only.",
+            metavar=STEM_ABOVE,
+            help="The stem above the leaf: as long as below it, not there, or with a length of its own; by default "
+            f"{_by_method('stem_above')}. Without a length of its own the model has the paper's six parameters.",
         ),
-    ] = FIT["stem_above"],
+    ] = None,
     labels: Annotated[
         str, typer.Option(help="Name of the label property (1 stem, 2.. leaves); none: use no labels.")
     ] = "label",

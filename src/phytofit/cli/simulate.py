@@ -17,7 +17,7 @@ from phytofit.cli.options import (
     SpheresOption,
     ViewsOption,
 )
-from phytofit.cli.settings import defaults_of
+from phytofit.cli.settings import defaults_of, entries_of
 from phytofit.errors import SettingError
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["simulate_command"]
 
 SPECIES = defaults_of("species", "load_species")["species"]
+STEM_ABOVE = "|".join(entries_of("species", "STEM_ABOVE"))
 SIMULATE = defaults_of("simulation", "simulate")
 
 
@@ -38,6 +39,10 @@ def simulate_command(
         list[str] | None,
         typer.Option("--set", help="NAME=VALUE fixes a parameter that is else drawn from the species' range."),
     ] = None,
+    stem_above: Annotated[
+        str,
+        typer.Option(metavar=STEM_ABOVE, help="The stem above the leaf: as long as below it, not there, or drawn too."),
+    ] = SIMULATE["stem_above"],
     points: Annotated[int, typer.Option(help="Points on each, before spheres are removed.")] = SIMULATE["n_points"],
     noise: NoiseOption = SIMULATE["noise_cm"],
     noise_reach: NoiseReachOption = SIMULATE["noise_reach_cm"],
@@ -69,6 +74,7 @@ def simulate_command(
         simulate(
             chosen,
             fixed=fixed,
+            stem_above=stem_above,
             n_points=points,
             noise_cm=noise,
             noise_reach_cm=noise_reach,

@@ -7,9 +7,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from phytofit.models.organs import LEAF, STEM, Organ, frames_along
 
-__all__ = ["Phytomer"]
+__all__ = ["N_PAPER", "Phytomer"]
 
 FloatArray = NDArray[np.float64]
+N_PAPER = 6  # parameters of Eq. (1)
 COLLAR_CM = 0.5  # above and below the junction, where the stem's diameter changes, if it does
 N_TAPERED = 3  # pieces of a stem that tapers, above the leaf and below it
 MOST_TAPERED = 2.0  # of the logarithm of the diameter, at the ends of a stem that tapers
@@ -26,10 +27,11 @@ class Phytomer:
 
     ``n_pieces`` midrib segments, of which the last ``slow_share`` (the paper's 20 %) bend half as much;
     ``widest_share`` n_pieces is the paper's i_max; ``concavity`` is k of Eq. (2), 1 to 3.  The bend is X6 per thirtieth
-    of the leaf, so another `n_pieces` gives the same leaf, more or less finely.
+    of the leaf, so another `n_pieces` gives the same leaf, more or less finely.  The paper does not say where along
+    the stem the leaf joins: without `stem_length_above` the stem above the leaf is ``stem_above`` times as long as X2.
 
     What follows Eq. (1) is not the paper's.  A parameter that is left out has the value that gives the paper's model:
-    no stem above the leaf, a leaf that starts at the stem's axis and stays in one plane, and Eq. (2) as it is.
+    a leaf that starts at the stem's axis and stays in one plane, and Eq. (2) as it is.
 
     ====================== ===== =================================================================================
     stem_length_above      cm    of the stem above the height at which the leaf starts
@@ -54,6 +56,7 @@ class Phytomer:
     widest_share: float = 0.5
     slow_share: float = 0.2
     concavity: float = 2.0
+    stem_above: float = 0.0
 
     PARAMETERS = (  # Eq. (1), in its order; then what is not the paper's
         "stem_diameter",
@@ -99,7 +102,7 @@ class Phytomer:
 
     @property
     def neutral(self) -> FloatArray:
-        """Values (k,) of the parameters; those after the sixth give the paper's model."""
+        """Values (k,) of the parameters; those after the sixth give the paper's model, with no stem above the leaf."""
         return np.array([*[np.nan] * 6, *[0.0] * 8, 1.0, self.widest_share, self.concavity, 1.0, 0.0, 1.0, 0.0])
 
     def width_profile(
@@ -143,6 +146,8 @@ class Phytomer:
         """
         xs = np.atleast_2d(np.asarray(xs, float))
         n, given = xs.shape
+        if given == N_PAPER:
+            xs, given = np.hstack([xs, self.stem_above * xs[:, 1:2]]), given + 1
         rest = np.broadcast_to(self.neutral[given:], (n, len(self.PARAMETERS) - given))
         diameter, below, leaf_angle, leaf_length, leaf_width, rotate, above, offset, *shape = np.hstack([xs, rest]).T
         bow, wave, side_bend, side_bow, roll, twist, *profile, ratio, base_bend, shoulder, stem_taper = shape
@@ -181,17 +186,20 @@ class Phytomer:
         leaf = Organ(LEAF, midrib, frame, 0.5 * leaf_width[:, np.newaxis] * share)
         return stem, leaf
 
-    @classmethod
-    def upside_down(cls, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The other parameters x (k,) of the same organs, seen upside down: ``turn @ x + offset``; k is 7 or more.
+    def upside_down(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """The other parameters x (k,) of the same organs, seen upside down: ``turn @ x + offset``; or None, where this
+        model can't have it: its stem must be longer on one side of the leaf.
 
         Returns turn (k, k), offset (k,) and the pose (4, 4) from the other plant's frame to this one's.  Without what
         is known of leaves (they leave the stem upwards and bend down) no cloud can tell the two apart.  Of plants near
         x it is true to first order, where the stem has two diameters.
         """
-        names = cls.PARAMETERS[: len(x)]
+        names = self.PARAMETERS[: len(x)]
         turn = np.eye(len(x))
-        turn[[1, 6]] = turn[[6, 1]]  # what was below the leaf is above it
+        if len(x) > N_PAPER:
+            turn[[1, 6]] = turn[[6, 1]]  # what was below the leaf is above it
+        elif self.stem_above != 1.0:
+            return None
         for name in (
             "leaf_angle",
             "leaf_rotate_angle",
@@ -206,7 +214,7 @@ class Phytomer:
         there = turn @ x
         there[2] += 180.0
         if "stem_diameter_above" in names:
-            above, taper = names.index("stem_diameter_above"), cls.PARAMETERS.index("stem_taper")
+            above, taper = names.index("stem_diameter_above"), self.PARAMETERS.index("stem_taper")
             diameter, ratio, slope = x[0], x[above], x[taper] if taper < len(x) else 0.0
             half = 0.5 * (x[1] + x[6])  # from the middle of what is below the leaf to that of what is above it
             other = ratio * diameter * np.exp(-slope * half / diameter)
@@ -223,7 +231,7 @@ class Phytomer:
             there[[0, above]] = other, 1.0 / ratio
         offset = there - turn @ x
         pose = np.diag([1.0, -1.0, -1.0, 1.0])
-        pose[2, 3] = x[1] + x[6]
+        pose[2, 3] = x[1] + (x[6] if len(x) > N_PAPER else self.stem_above * x[1])
         return turn, offset, pose
 
 

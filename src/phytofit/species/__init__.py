@@ -11,11 +11,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from phytofit.bundled import species_folder, species_names
 from phytofit.errors import SettingError, SpeciesError
-from phytofit.models.phytomer import Phytomer
+from phytofit.models.phytomer import N_PAPER, Phytomer
 from phytofit.parameters import Parameter, ParameterSpace
 
-__all__ = ["Species", "load_species"]
+__all__ = ["STEM_ABOVE", "Species", "load_species"]
 
+STEM_ABOVE = {"equal": 1.0, "none": 0.0, "free": np.nan}  # times as long as below the leaf
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # no text, no true or false
 
 
@@ -34,6 +35,17 @@ class Species:
     def leading(self, n: int) -> "Species":
         """The species with the first `n` of its parameters only: 6 are the paper's."""
         return replace(self, space=ParameterSpace(self.space.parameters[:n]), ranges=self.ranges[:n])
+
+    def with_stem_above(self, how: str) -> "Species":
+        """The species whose stem above the leaf is "free" (a parameter of its own), "equal" to that below, or "none".
+
+        The last two have the six parameters of Eq. (1) only.  Raises SettingError for anything else.
+        """
+        if how not in STEM_ABOVE:
+            raise SettingError(f"stem_above: expected one of {', '.join(STEM_ABOVE)}, got {how!r}")
+        if how == "free":
+            return self
+        return replace(self.leading(N_PAPER), model=replace(self.model, stem_above=STEM_ABOVE[how]))
 
 
 class _Constants(BaseModel):
@@ -98,7 +110,7 @@ def _assemble(file: _File, where: str) -> Species:
     known = Phytomer.PARAMETERS
     unknown = sorted(set(file.parameters) - set(known))
     given = max((known.index(name) for name in file.parameters if name in known), default=0)
-    missing = [name for name in known[: max(given, 6)] if name not in file.parameters]
+    missing = [name for name in known[: max(given, N_PAPER)] if name not in file.parameters]
     if unknown or missing:
         found = f"unknown {', '.join(unknown)}" if unknown else f"no {', '.join(missing)}"
         raise SpeciesError(f"{where}: parameters: {found}; the {file.model} has {', '.join(known)}")
