@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from phytofit.errors import OutputError
+from phytofit.errors import OutputError, PhytofitError
 
 __all__ = [
     "check_made",
@@ -30,6 +30,7 @@ __all__ = [
     "made_in",
     "prepare_folder",
     "repair",
+    "translated",
     "whole_file",
     "whole_files",
     "whole_folder",
@@ -48,7 +49,7 @@ RECORDS = ("fit.json", "segmentation.json", "reconstruction.json", "stage.json")
 def prepare_folder(folder: Path) -> Path:
     """Make sure that results can be written to the folder, and repair what an earlier run left there; OutputError if
     they can't."""
-    with _said(folder, "results can't be written there", "choose another folder"):
+    with translated(folder, "results can't be written there", "choose another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         repair(folder)
         probe = folder / _hidden(PART)
@@ -77,7 +78,7 @@ def repair(folder: Path) -> None:
 def whole_file(path: Path) -> Iterator[Path]:
     """A hidden file to write into, which becomes ``path`` when all is written; OutputError if it can't."""
     part = path.with_name(_hidden(PART) + path.suffix)
-    with _said(path, "can't be written", ROOM):
+    with translated(path, "can't be written", ROOM):
         try:
             yield part
             part.replace(path)
@@ -91,7 +92,7 @@ def whole_files(folder: Path, instead_of: Iterable[Path] = ()) -> Iterator[Path]
     `instead_of` those that are deleted: all of this is done, or nothing.  OutputError if it can't."""
     prepare_folder(folder)
     with (
-        _said(folder, "the result can't be written", ROOM),
+        translated(folder, "the result can't be written", ROOM),
         _installed(folder) as part,
     ):
         yield part
@@ -107,7 +108,7 @@ def whole_folder(folder: Path, name: str, *marks: str) -> Iterator[Path]:
     Raises OutputError where there is a folder of that name with none of the files `marks`: no result of this kind.
     """
     target = folder / name
-    with _said(target, "the result can't be written", ROOM):
+    with translated(target, "the result can't be written", ROOM):
         target = target.resolve() if target.is_symlink() else target
         if os.path.lexists(target) and not _is_empty(target) and not any((target / it).is_file() for it in marks):
             raise OutputError(
@@ -137,7 +138,7 @@ def made_in(folder: Path) -> set[tuple[str, str | None]]:
 
 def check_made(path: Path, is_ours: Callable[[Path], bool]) -> None:
     """OutputError if there is a file of that name that phytofit did not make."""
-    with _said(path, "can't be read", "choose another folder"):
+    with translated(path, "can't be read", "choose another folder"):
         if os.path.lexists(path) and not (path.is_file() and is_ours(path)):
             raise OutputError(
                 f"{path}: it is there already, and not as phytofit made it; move it away, or choose another folder"
@@ -146,7 +147,7 @@ def check_made(path: Path, is_ours: Callable[[Path], bool]) -> None:
 
 def delete_made(folder: Path) -> None:
     """Delete what phytofit made of a result, and its folder if nothing else is in it; OutputError if that fails."""
-    with _said(folder, "can't be deleted", "delete it"):
+    with translated(folder, "can't be deleted", "delete it"):
         for name, known in made_in(folder):
             if (folder / name).is_file() and file_hash(folder / name) == known:
                 (folder / name).unlink()
@@ -276,11 +277,11 @@ def _forget(path: Path) -> None:
 
 
 @contextmanager
-def _said(path: Path, what: str, remedy: str) -> Iterator[None]:
-    """OSError as OutputError, in one sentence."""
+def translated(path: Path, what: str, remedy: str) -> Iterator[None]:
+    """OSError, and text that is none, as OutputError, in one sentence."""
     try:
         yield
-    except OutputError:
+    except PhytofitError:
         raise
     except (OSError, UnicodeError) as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)

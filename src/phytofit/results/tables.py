@@ -15,7 +15,7 @@ import pandas as pd
 from pandas.api.types import is_numeric_dtype
 
 from phytofit.errors import OutputError
-from phytofit.results.replacing import check_made, whole_file
+from phytofit.results.replacing import check_made, translated, whole_file
 from phytofit.text import for_table, from_table, one_line
 
 __all__ = ["FolderTable", "check_table", "read_table", "table_text", "write_failures", "write_table", "write_workbook"]
@@ -130,15 +130,23 @@ def write_failures(folder: Path, failed: dict[str, tuple[Path, str]], tried: Ite
     path = folder / "failed.csv"
     check_table(path, FAILURES)
     rows = pd.DataFrame([(name, str(file), why) for name, (file, why) in failed.items()], columns=FAILURES)
-    if path.is_file():
-        before = pd.read_csv(path, dtype=str, keep_default_na=False, encoding="utf-8-sig")
-        again = {for_table(file) for file in tried}
-        rows = pd.concat([before[~before["file"].isin(again)], rows], ignore_index=True)
-    if rows.empty:
-        path.unlink(missing_ok=True)
-        return None
+    with translated(path, "can't be written", "delete it"):
+        if path.is_file():
+            before = _failures_before(path)
+            again = {for_table(file) for file in tried}
+            rows = pd.concat([before[~before["file"].isin(again)], rows], ignore_index=True)
+        if rows.empty:
+            path.unlink(missing_ok=True)
+            return None
     write_table(path, rows)
     return path
+
+
+def _failures_before(path: Path) -> pd.DataFrame:
+    try:
+        return pd.read_csv(path, dtype=str, keep_default_na=False, encoding="utf-8-sig")[FAILURES]
+    except (KeyError, ValueError):
+        raise OutputError(f"{path}: expected the columns {', '.join(FAILURES)}; delete it") from None
 
 
 def write_workbook(path: Path, table: pd.DataFrame) -> None:

@@ -12,7 +12,7 @@ import pandas as pd
 
 from phytofit.cloud import READERS
 from phytofit.errors import InputError
-from phytofit.text import for_table
+from phytofit.text import for_file_name, for_table
 
 __all__ = ["PAIR_COLUMNS", "Comparison", "compare"]
 
@@ -152,7 +152,8 @@ def _as_path(name: str) -> str:
 
 
 def _as_file(name: str) -> str:
-    return _as_path(name.replace("\\", "/").rpartition("/")[2])
+    """As a result's folder is called."""
+    return _as_path(for_file_name(_exact(name).removeprefix("'").replace("\\", "/").rpartition("/")[2]))
 
 
 def _as_words(name: str) -> str:
