@@ -236,8 +236,8 @@ def widest_side(points: FloatArray, up: FloatArray) -> FloatArray:
     """The level direction (3,) along which points (n, 3), seen from the axis, spread most; the sign by where most of
     them are."""
     level = points - np.outer(points @ up, up)
-    _, _, ways = np.linalg.svd(level, full_matrices=True)
-    best = ways[0] - (ways[0] @ up) * up
+    way = np.linalg.eigh(level.T @ level)[1][:, -1]
+    best = way - (way @ up) * up
     if np.linalg.norm(best) < 0.5:  # nothing lies off the axis: any level direction will do
         best = np.eye(3)[int(np.argmin(np.abs(up)))]
         best = best - (best @ up) * up
