@@ -33,18 +33,27 @@ def help_of(*command):
     return " ".join(done.output.replace("│", " ").split())
 
 
-@pytest.mark.parametrize("command", [(), *((name,) for name in COMMANDS)], ids=lambda c: " ".join(c) or "phytofit")
-def test_help_imports_nothing_slow(command):
+def test_help_imports_nothing_slow():
     code = (
         "import sys\nfrom phytofit.cli import app\n"
-        "app([*sys.argv[1:], '--help'], standalone_mode=False)\n"
+        "for command in ([], *([name] for name in sys.argv[1:])):\n"
+        "    app([*command, '--help'], standalone_mode=False)\n"
         f"print('slow:', sorted(set({SLOW!r}) & set(sys.modules)))"
     )
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, check=False)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run([sys.executable, "-c", code, *COMMANDS], capture_output=True, text=True, check=False)
     assert done.stdout.endswith("slow: []\n"), done.stdout[-200:] + done.stderr
-    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime < MOST_CPU_S
+    assert all(f"phytofit {name} " in done.stdout.replace("-c ", "phytofit ") for name in COMMANDS)
+
+
+def test_help_takes_less_than_half_a_second():
+    """Of the processor; the least of three, since what else runs on the machine adds to it."""
+    took = []
+    for _ in range(3):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, "-m", "phytofit", "fit", "--help"], stdout=subprocess.DEVNULL, check=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        took.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    assert min(took) < MOST_CPU_S
 
 
 @pytest.mark.parametrize(

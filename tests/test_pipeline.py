@@ -207,10 +207,10 @@ def test_phyllotaxy_follows_from_azimuths():
     ("arguments", "said"),
     [
         (["images"], "needs --camera"),
-        (["plant.ply", "--camera", "kinect-v2"], "--camera is for a folder"),
+        (["plant.ply", "--camera", "kinect-v2"], "--camera: for a folder of depth images"),
         (["nothing.ply", "--units", "cm"], "nothing.ply"),
         (["plant.ply"], "unit"),
-        (["images", "--camera", "kinect-v2"], "images"),
+        (["images", "--camera", "kinect-v2"], "view.png"),
         (["images", "--camera", "kinect-v2", "--pattern", "/x/*.png"], "--pattern"),
         (["out", "--camera", "kinect-v2"], "can't hold the results"),
     ],
@@ -218,6 +218,8 @@ def test_phyllotaxy_follows_from_azimuths():
 def test_the_command_says_what_is_wrong(made, tmp_path, monkeypatch, arguments, said):
     (tmp_path / "images").mkdir()
     (tmp_path / "out").mkdir()
+    for folder in ("images", "out"):
+        (tmp_path / folder / "view.png").write_bytes(b"no image")
     shutil.copy(made[0] / "plant.ply", tmp_path)
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(app, ["run", *arguments, "--out", "out"])

@@ -401,7 +401,8 @@ class TestCommandLine:
     def test_results_are_written_and_read_back(self, ran):
         done, out = ran
         assert done.exit_code == 0, done.output
-        assert sorted(p.name for p in out.iterdir()) == ["plant.ply", "reconstruction.json", "reconstruction.png"]
+        names = ["phytofit.log", "plant.ply", "reconstruction.json", "reconstruction.png"]
+        assert sorted(p.name for p in out.iterdir()) == names
         stored = json.loads((out / "reconstruction.json").read_text())
         assert stored["turntable"]["step_deg"] == pytest.approx(scene.STEP_DEG, abs=0.4)
         assert len(stored["views"]) == N_VIEWS
@@ -421,7 +422,7 @@ class TestCommandLine:
         assert done.exit_code == 2
         assert "expected 512 x 424" in done.output
         assert len(done.output.strip().splitlines()) == 1
-        assert not list((tmp_path / "out").iterdir())
+        assert [path.name for path in (tmp_path / "out").iterdir()] == ["phytofit.log"]
 
     def test_a_folder_that_can_not_be_written(self, result, tmp_path):
         (tmp_path / "file").touch()

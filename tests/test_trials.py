@@ -108,8 +108,8 @@ def test_the_command_answers(tmp_path):
         (["results"], "expected a folder of results with --truth"),
         (["results", "--simulate"], "expected a folder of results with --truth"),
         (["--simulate", "--truth", "t.csv"], "expected a folder of results with --truth"),
-        (["--simulate", "--noise", "-1"], "noise: expected a number of 0 or more"),
-        (["--simulate", "--views", "0"], "views: expected a number of 1 or more"),
+        (["--simulate", "--noise", "-1"], "'--noise': expected 0 or more, got -1"),
+        (["--simulate", "--views", "0"], "'--views': expected 1 to 1,000, got 0"),
         (["--simulate", "--species", "nowhere.toml"], "nowhere.toml"),
     ],
 )

@@ -52,6 +52,7 @@ class World:
         cloud = from_points(self.points, "cm")
         for name in ("a", "b"):
             write_cloud(folder / f"{name}.ply", cloud)
+        (folder / "view.png").touch()  # which makes it a folder of images, too
         (folder / "results").mkdir()
         rows = [("a", 1, "leaf", 1, "leaf_length", 50.0, "cm", 48.0, 52.0, "likelihood", "")]
         pd.DataFrame(rows, columns=COLUMNS).to_csv(folder / "results" / "traits.csv", index=False)

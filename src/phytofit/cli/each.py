@@ -1,12 +1,14 @@
 """What the commands that take many clouds share: one after the other, and how that ends."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 import typer
 
-from phytofit.cli.console import complain, tell
+from phytofit.cli.console import complain, say
+from phytofit.cli.progress import Items, Told
 from phytofit.errors import PhytofitError
 
 if TYPE_CHECKING:
@@ -20,7 +22,7 @@ T = TypeVar("T")
 def measure_each(
     clouds: Sequence[Path],
     folder: Path,
-    measured: Callable[[Path, str], T],
+    measured: Callable[[Path, str, Told], T],
     table: "Callable[[Path], FolderTable]",
     show: Callable[[T, str, Path], None],
     done: str,
@@ -31,10 +33,16 @@ def measure_each(
     measured, 1 if some were, 2 if none was."""
     from phytofit.batch import each_cloud
 
+    items, counter = Items(len(clouds), "cloud"), itertools.count()
+
+    def in_view(path: Path, name: str) -> T:
+        with items.item(next(counter), name) as told:
+            return measured(path, name, told)
+
     n_done = 0
     whole = True
     try:
-        for made in each_cloud(clouds, folder, measured, table, workbook=workbook):
+        for made in each_cloud(clouds, folder, in_view, table, workbook=workbook):
             if made.result is None:
                 complain(made.failure)
             else:
@@ -44,5 +52,5 @@ def measure_each(
         complain(error)
         whole = False
     if n_done and whole:
-        tell(f"{n_done} of {len(clouds)} {done}")
+        say(f"{n_done} of {len(clouds)} {done}")
     raise typer.Exit(0 if whole and n_done == len(clouds) else 1 if n_done else 2)

@@ -4,12 +4,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from phytofit.cli.console import app, err, or_exit, out, read_quietly, tell
+from phytofit.cli.console import command, read_quietly, results_in, say, show
 from phytofit.cli.each import measure_each
+from phytofit.cli.inputs import cloud_files
 from phytofit.cli.options import (
+    MOST_POINTS,
     MeshOption,
     OutOption,
     Seed,
@@ -18,9 +19,13 @@ from phytofit.cli.options import (
     UnitsOption,
     UpOption,
     WorkbookOption,
+    choice,
+    numeric,
+    only,
 )
+from phytofit.cli.progress import Told
 from phytofit.cli.settings import defaults_of, entries_of
-from phytofit.cli.tables import interval, print_remarks
+from phytofit.cli.tables import interval, print_remarks, print_skipped
 from phytofit.errors import SettingError
 from phytofit.text import for_terminal
 
@@ -29,11 +34,12 @@ if TYPE_CHECKING:
     from phytofit.fitted import Fit
     from phytofit.optimize import Generation
 
-__all__ = ["fit_command", "fit_with_progress"]
+__all__ = ["fit_command", "fit_in_view"]
 
 FIT = defaults_of("fitting", "fit")
-DISTANCES = ", ".join(entries_of("distances", "DISTANCES"))
-STEM_ABOVE = "|".join(entries_of("species", "STEM_ABOVE"))
+STEM_ABOVE = [*entries_of("species", "STEM_ABOVE")]
+DISTANCES = [*entries_of("distances", "DISTANCES")]
+SEARCH_SHARE = 0.3  # of the time of a fit by the default method; the rest refines what was found
 METHODS = {name: defaults_of("fitting", function) for name, function in entries_of("fitting", "METHODS").items()}
 
 
@@ -41,9 +47,17 @@ def _by_method(setting: str) -> str:
     return ", ".join(f"{settings[setting]} for {name}" for name, settings in METHODS.items())
 
 
-@app.command("fit")
+@command("fit")
 def fit_command(
-    clouds: Annotated[list[Path], typer.Argument(help="Point clouds: PLY, PCD, LAS/LAZ, XYZ, TXT, CSV, PTS, ASC.")],
+    context: typer.Context,
+    clouds: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="CLOUDS",
+            help="Point clouds (PLY, PCD, LAS/LAZ, XYZ, TXT, CSV, PTS, ASC), folders of them, or patterns.",
+            show_default=False,
+        ),
+    ],
     units: UnitsOption = None,
     species: SpeciesOption = FIT["species"],
     up: UpOption = None,
@@ -51,81 +65,96 @@ def fit_command(
         list[str] | None,
         typer.Option(
             metavar="X,Y,Z",
-            help="A point on the leaf that is meant, in the cloud's unit, where others show too; one a piece.",
+            help="A point on the leaf to measure, in the cloud's unit, where the cloud shows other leaves too; "
+            "give one for each piece of a leaf.",
         ),
     ] = None,
     method: Annotated[
         str,
-        typer.Option(
-            help="likelihood: the most probable phytomer, with 95 % intervals. "
-            "paper: the search of Sodhi et al., IROS 2018, for the least distance."
+        choice(
+            "likelihood: the most probable phytomer, with 95 % intervals. "
+            "paper: the search of Sodhi et al., IROS 2018, for the least distance.",
+            among=[*METHODS],
         ),
     ] = FIT["method"],
     distance: Annotated[
         str | None,
-        typer.Option(help=f"What --method paper minimises: {DISTANCES}; hausdorff by default."),
+        choice(
+            f"What --method paper minimises: {', '.join(DISTANCES)}; {METHODS['paper']['distance']} by default.",
+            among=DISTANCES,
+        ),
     ] = None,
     samples: Annotated[
-        int | None, typer.Option(help=f"Candidates a generation of the search; by default {_by_method('n_samples')}.")
+        int | None,
+        numeric(
+            f"Candidates in each generation of the search; by default {_by_method('n_samples')}.", least=1, most=100_000
+        ),
     ] = None,
     points: Annotated[
         int | None,
-        typer.Option(
-            help="Points of the cloud after thinning, for --method paper also of a candidate; by default "
-            f"{_by_method('n_points')}."
+        numeric(
+            f"Points to which the cloud is thinned; by default {_by_method('n_points')}, which also gives each "
+            "candidate so many.",
+            least=1,
+            most=MOST_POINTS,
         ),
     ] = None,
     generations: Annotated[
-        int | None, typer.Option(help=f"Generations of the search; by default {_by_method('n_generations')}.")
+        int | None,
+        numeric(f"Generations of the search; by default {_by_method('n_generations')}.", least=1, most=10_000),
     ] = None,
     random_start: Annotated[
         bool, typer.Option("--random-start", help="Start from means drawn from the prior (Fig. 7d of the paper).")
     ] = FIT["random_start"],
     stem_above: Annotated[
         str | None,
-        typer.Option(
-            metavar=STEM_ABOVE,
-            help="The stem above the leaf: as long as below it, not there, or with a length of its own; by default "
-            f"{_by_method('stem_above')}. Without a length of its own the model has the paper's six parameters.",
+        choice(
+            f"The stem above the leaf, {', '.join(STEM_ABOVE)}: as long as below it, not there, of a length of its "
+            f"own; by default {_by_method('stem_above')}. Without a length of its own the model has the paper's six "
+            "parameters.",
+            among=STEM_ABOVE,
         ),
     ] = None,
     labels: Annotated[
-        str, typer.Option(help="Name of the label property (1 stem, 2.. leaves); none: use no labels.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Property that holds labels (1 stem, 2 and up leaves); none: use no labels.",
+        ),
     ] = "label",
     seed: Seed = FIT["seed"],
     threads: ThreadsOption = None,
     folder: OutOption = Path("results"),
-    mesh: MeshOption = None,
+    meshes: MeshOption = None,
     workbook: WorkbookOption = False,
     convergence: Annotated[
         bool, typer.Option("--convergence", help="Write convergence.png as well: how the search went.")
     ] = False,
 ) -> None:
-    """Measure phytomers: one leaf on its piece of stem a cloud, in any orientation.
+    """Measure phytomers: one leaf on its piece of stem in each cloud, in any orientation.
 
     Prints a table of traits and writes, for each cloud, DIR/NAME/ with fit.png (the model on the points),
-    traits.csv, model.ply and fit.json; and DIR/traits.csv over all.
+    traits.csv, model.ply and fit.json; and DIR/traits.csv over all. A whole plant is measured by
+    phytofit run.
 
     Examples:
 
         phytofit fit leaf.ply --units cm
 
-        phytofit fit scans/*.ply --units mm --up z --out results
+        phytofit fit scans --units mm --up z --out results
 
         phytofit fit crowded.ply --units cm --seed-point 12.5,-3,40
     """
-    from phytofit.parsing import parse_up
-    from phytofit.results import check_meshes, fit_tables, save_fit
+    from phytofit.results import fit_tables, save_fit
     from phytofit.species import load_species
 
-    seed_points = or_exit(lambda: _seed_points(seed_point or [], len(clouds)))
-    chosen = or_exit(lambda: load_species(species))
-    or_exit(lambda: parse_up(up))
-    meshes = or_exit(lambda: check_meshes(mesh or []))
+    if method != "paper":
+        only(context, ["distance"], "it changes nothing without --method paper; leave it out")
+    files, skipped = cloud_files(clouds)
     settings: dict[str, Any] = {
-        "species": chosen,
+        "species": load_species(species),
         "up": up,
-        "seed_point": seed_points,
+        "seed_point": _seed_points(seed_point or [], len(files)),
         "method": method,
         "distance": distance,
         "n_samples": samples,
@@ -137,15 +166,16 @@ def fit_command(
         "threads": threads,
     }
 
-    def measured(path: Path, name: str) -> "Fit":
+    def measured(path: Path, name: str, told: Told) -> "Fit":
         cloud = read_quietly(path, units, None if labels == "none" else labels)
-        result = fit_with_progress(cloud, name, settings)
-        save_fit(result, cloud, folder, name, meshes=meshes, convergence=convergence)
+        result = fit_in_view(cloud, settings, told)
+        save_fit(result, cloud, folder, name, meshes=meshes or (), convergence=convergence)
         return result
 
-    measure_each(
-        clouds, folder, measured, fit_tables, _print_fit, f"clouds measured: {folder / 'traits.csv'}", workbook=workbook
-    )
+    with results_in(folder):
+        print_skipped(skipped)
+        done = f"clouds measured: {folder / 'traits.csv'}"
+        measure_each(files, folder, measured, fit_tables, _print_fit, done, workbook=workbook)
 
 
 def _seed_points(given: list[str], n_clouds: int) -> list[list[float]] | None:
@@ -160,21 +190,20 @@ def _seed_points(given: list[str], n_clouds: int) -> list[list[float]] | None:
     return points or None
 
 
-def fit_with_progress(cloud: "PointCloud", name: str, settings: dict[str, Any]) -> "Fit":
-    """The fit of a cloud, with a bar on a terminal."""
+def fit_in_view(cloud: "PointCloud", settings: dict[str, Any], told: Told) -> "Fit":
+    """The fit of a cloud, which tells how far it is."""
     from phytofit.fitting import fit
 
-    by_default = METHODS.get(settings.get("method", FIT["method"]), {}).get("n_generations")
+    by_default = METHODS[settings.get("method", FIT["method"])]["n_generations"]
     generations = settings.get("n_generations") or by_default
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[errors]}"))
-    with Progress(*columns, TimeElapsedColumn(), console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(f"{for_terminal(name)}: start pose", total=generations, errors="")
+    told("start pose", 0.0)
 
-        def told(generation: "Generation") -> None:
-            errors = f"best {generation.best_error:.2f}, elite {generation.threshold:.2f}"
-            bar.update(task, completed=generation.index, description=f"{for_terminal(name)}: search", errors=errors)
+    def searched(generation: "Generation") -> None:
+        told(
+            "search" if generation.index < generations else "refinement", SEARCH_SHARE * generation.index / generations
+        )
 
-        return fit(cloud, progress=told, **settings)
+    return fit(cloud, progress=searched, **settings)
 
 
 def _print_fit(result: "Fit", name: str, where: Path) -> None:
@@ -183,8 +212,8 @@ def _print_fit(result: "Fit", name: str, where: Path) -> None:
         table.add_column(column, justify="right" if column in ("value", "95 % interval") else "left")
     for trait in result.traits:
         table.add_row(trait.organ, trait.name, f"{trait.value:.2f}", interval(trait), trait.unit)
-    out.print(table)
-    print_remarks(result)
+    show(table)
+    print_remarks(result.notes, result.flags)
     unit = "relative" if result.relative else "cm"
     if result.estimate is None:
         said = f"{result.settings['distance']} distance {result.error:.2f} {unit}"
@@ -194,4 +223,4 @@ def _print_fit(result: "Fit", name: str, where: Path) -> None:
             f"noise {stem:.2f} {unit} on the stem, {leaf:.2f} on the leaf, {thickness:.2f} more across it; "
             f"{100 * result.estimate.share[2]:.0f} % outliers"
         )
-    tell(f"{said}; model on the points: {where / 'fit.png'}")
+    say(f"{said}; model on the points: {where / 'fit.png'}")

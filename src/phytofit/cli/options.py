@@ -1,12 +1,17 @@
-"""Options that several commands share."""
+"""Options that several commands share, and how each kind of option is checked."""
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from phytofit.bundled import species_names
-from phytofit.cli.settings import entries_of
+from phytofit.cli.messages import meant
+from phytofit.cli.settings import entries_of, value_of
+from phytofit.errors import SettingError
+from phytofit.text import one_line
 
 __all__ = [
     "CameraOption",
@@ -20,6 +25,7 @@ __all__ = [
     "PatternOption",
     "PosesOption",
     "Seed",
+    "SpacingOption",
     "SpeciesOption",
     "SphereDiameterOption",
     "SpheresOption",
@@ -29,54 +35,150 @@ __all__ = [
     "UpOption",
     "ViewsOption",
     "WorkbookOption",
+    "choice",
+    "numeric",
+    "only",
 ]
 
-AXES = ", ".join(entries_of("parsing", "AXES"))
-CAMERAS = ", ".join(entries_of("reconstruct.cameras", "PRESETS"))
+MOST_POINTS = 10_000_000  # some GB of memory; no scanner gives more of one plant
+MOST_SEED = 2**53  # up to which every number is exact in JSON
+MOST_THREADS = 1024
 
-Seed = Annotated[int, typer.Option(help="The same seed gives the same result.", min=0)]
+
+def numeric(
+    help: str,  # noqa: A002  (typer's name)
+    *names: str,
+    least: float = -math.inf,
+    most: float = math.inf,
+    above: float = -math.inf,
+    below: float = math.inf,
+) -> Any:
+    """An option that is a finite number in a range."""
+    lows = [f"{least:,g}"] if least > -math.inf else [f"above {above:,g}"] if above > -math.inf else []
+    highs = [f"{most:,.15g}"] if most < math.inf else [f"below {below:,g}"] if below < math.inf else []
+    expected = " to ".join([*lows, *highs]) or "a finite number"
+    if lows and not highs:
+        expected = lows[0] if above > least else f"{lows[0]} or more"
+
+    def check(value: float | None) -> float | None:
+        if value is None or (least <= value <= most and above < value < below and math.isfinite(value)):
+            return value
+        raise typer.BadParameter(f"expected {expected}, got {value:g}")
+
+    return typer.Option(*names, help=help, callback=check)
+
+
+def choice(help: str, *names: str, among: Sequence[str], file: str = "", **more: Any) -> Any:  # noqa: A002
+    """An option that is one of some words; or, with `file`, also a path with that ending."""
+
+    def check(given: str | list[str] | None) -> str | list[str] | None:
+        for value in given if isinstance(given, list) else filter(None, [given]):
+            if value not in among and not (file and (value.lower().endswith(file) or Path(value).is_file())):
+                others = f", or a {file[1:].upper()} file" if file else ""
+                said = f"expected {', '.join(among)}{others}, got {one_line(value)!r}"
+                raise typer.BadParameter(f"{said}{meant(value, [*among])}")
+        return given
+
+    def complete(incomplete: str) -> list[str]:
+        return [name for name in among if name.startswith(incomplete)]
+
+    return typer.Option(*names, help=help, callback=check, autocompletion=complete, **more)
+
+
+def only(context: typer.Context, options: Sequence[str], why: str) -> None:
+    """SettingError if one of these options was given, which would change nothing."""
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name in options and source is not None and source.name == "COMMANDLINE":
+            raise SettingError(f"{max(parameter.opts, key=len)}: {why}")
+
+
+AXES = [*entries_of("parsing", "AXES")]
+CAMERAS = [*entries_of("reconstruct.cameras", "PRESETS")]
+UNITS = [*entries_of("cloud.units", "SCALE_CM")]
+DEPTH_UNITS = [unit for unit in UNITS if unit != "none"]
+SPECIES = species_names()
+MESHES = value_of("results.models", "MESHES")
+
+Seed = Annotated[int, numeric("The same seed gives the same result.", least=0, most=MOST_SEED)]
 SpeciesOption = Annotated[
-    str, typer.Option(help=f"A species that comes with phytofit ({', '.join(species_names())}), or a TOML file.")
+    str,
+    choice(
+        f"A species that comes with phytofit ({', '.join(SPECIES)}), or a TOML file of your own.",
+        among=SPECIES,
+        file=".toml",
+    ),
 ]
-ThreadsOption = Annotated[int | None, typer.Option(help="Threads to work with; all cores by default.")]
+ThreadsOption = Annotated[
+    int | None, numeric("Threads to work with; all cores by default.", least=1, most=MOST_THREADS)
+]
 UnitsOption = Annotated[
-    str | None, typer.Option("--units", "-u", help="Unit of the coordinates: cm, mm, m; none: relative lengths.")
+    str | None,
+    choice(
+        f"Unit of the coordinates: {', '.join(UNITS[:-1])}; or {UNITS[-1]}, for lengths relative to each other. "
+        "Only LAS, LAZ and E57 files say it themselves (m).",
+        "--units",
+        "-u",
+        among=UNITS,
+    ),
 ]
-UpOption = Annotated[str | None, typer.Option(help=f"Upward direction where it is known: {AXES}.")]
+UpOption = Annotated[
+    str | None, choice(f"Which way is up in the cloud, where that is known: {', '.join(AXES)}.", among=AXES)
+]
 MeshOption = Annotated[
     list[str] | None,
-    typer.Option(help="The model also as obj or glb, each organ a named part; repeat for both."),
+    choice(
+        f"Write the model also as {', '.join(MESHES)}; repeat the option for more. In OBJ and GLB each organ "
+        "is a named part.",
+        "--mesh",
+        among=MESHES,
+    ),
 ]
-WorkbookOption = Annotated[bool, typer.Option("--xlsx", help="The table also as traits.xlsx.")]
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.", file_okay=True)]
-NoiseOption = Annotated[float, typer.Option(help="Gaussian noise a coordinate, cm.")]
+WorkbookOption = Annotated[bool, typer.Option("--xlsx", help="Write the table as traits.xlsx too.")]
+OutOption = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")]
+NoiseOption = Annotated[float, numeric("Standard deviation of the noise of each coordinate, cm.", least=0)]
 NoiseReachOption = Annotated[
-    float, typer.Option(help="How far neighbours share their noise, as in fused and stereo clouds, cm; 0: independent.")
+    float,
+    numeric("How far neighbours share their noise, as in fused and stereo clouds, cm; 0: independent.", least=0),
 ]
 ViewsOption = Annotated[
-    int | None, typer.Option(help="Cameras around the plant, which see what is not hidden; by default from everywhere.")
+    int | None,
+    numeric(
+        "Cameras around the plant, which see what is not hidden; by default it is seen from everywhere.",
+        least=1,
+        most=1000,
+    ),
 ]
-SpheresOption = Annotated[int, typer.Option(help="Spheres removed from each.")]
-SphereDiameterOption = Annotated[float, typer.Option(help="Their diameter, cm.")]
-OutliersOption = Annotated[float, typer.Option(help="Share of outliers added.")]
-
-
+SpheresOption = Annotated[int, numeric("Spheres that are removed from each cloud.", least=0, most=1000)]
+SphereDiameterOption = Annotated[float, numeric("Their diameter, cm.", above=0)]
+OutliersOption = Annotated[float, numeric("Share of outliers that are added, 0 to 1.", least=0, below=1)]
 CameraOption = Annotated[
     str,
-    typer.Option(
+    choice(
+        f"The depth camera: {', '.join(CAMERAS)}; or a TOML file with fx fy cx cy width height (pixels) and, where "
+        "needed, depth_scale, unit, distortion = \\[k1, k2, p1, p2, k3].",
         "--camera",
         "-c",
+        among=CAMERAS,
+        file=".toml",
         show_default=False,
-        help=f"{CAMERAS}; or a TOML file with fx fy cx cy width height (pixels) and, if need be, "
-        "depth_scale, unit, distortion = [k1, k2, p1, p2, k3].",
     ),
 ]
 StepOption = Annotated[
-    float | None, typer.Option(help="The turntable's nominal step, degrees; the true one is estimated either way.")
+    float | None,
+    numeric(
+        "How far the turntable turns between two images, degrees, roughly; it is estimated either way.",
+        least=-180,
+        most=180,
+    ),
 ]
 DepthUnitOption = Annotated[
     str | None,
-    typer.Option("--depth-unit", help="What a stored depth of 1 is: mm, cm or m; by default the camera's, mm."),
+    choice(
+        "Unit of the numbers in the depth images: mm, cm or m; by default the camera's.",
+        "--depth-unit",
+        among=DEPTH_UNITS,
+    ),
 ]
 PosesOption = Annotated[
     Path | None,
@@ -87,11 +189,18 @@ PosesOption = Annotated[
     ),
 ]
 PatternOption = Annotated[str, typer.Option(help="Which files of the folder are depth images.")]
+SpacingOption = Annotated[
+    float | None,
+    numeric(
+        "Distance between the cloud's points, cm; by default that of neighbouring pixels on the plant.",
+        above=0,
+    ),
+]
 LabelsOption = Annotated[
     str | None,
     typer.Option(
         metavar="NAME",
-        help="Take stem and leaves from this property (1 stem, 2.. leaves) instead of finding them: "
-        "`label` in a corrected plant.ply.",
+        help="Take stem and leaves from this property of the file (1 stem, 2 and up leaves) instead of finding them: "
+        "label, in a corrected plant.ply.",
     ),
 ]

@@ -2,14 +2,17 @@
 
 import json
 
-from phytofit.cli.console import app, out
+from phytofit.cli.console import command, out
 
 __all__ = ["recipe_command"]
 
 
-@app.command("recipe")
+@command("recipe")
 def recipe_command() -> None:
-    """Print every setting with its default, as JSON; each result's fit.json stores its own under "settings"."""
+    """Print every setting with its default, as JSON.
+
+    Each result stores its own in fit.json, under "settings".
+    """
     from phytofit.recipe import recipe
 
     out.print_json(json.dumps(recipe()))

@@ -1,16 +1,26 @@
 """The command that makes one cloud of depth images."""
 
+import itertools
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from phytofit.cli.console import app, complain, err, flag, out, tell
-from phytofit.cli.options import CameraOption, DepthUnitOption, OutOption, PatternOption, PosesOption, StepOption
-from phytofit.errors import PhytofitError
+from phytofit.cli.console import command, remark, results_in, say, show
+from phytofit.cli.inputs import check_images
+from phytofit.cli.options import (
+    CameraOption,
+    DepthUnitOption,
+    OutOption,
+    PatternOption,
+    PosesOption,
+    SpacingOption,
+    StepOption,
+)
+from phytofit.cli.progress import Items
+from phytofit.errors import InputError
 from phytofit.text import for_terminal
 
 if TYPE_CHECKING:
@@ -21,7 +31,7 @@ __all__ = ["reconstruct_command"]
 STAGES = 6  # that reconstruct tells of
 
 
-@app.command("reconstruct")
+@command("reconstruct")
 def reconstruct_command(
     images: Annotated[Path, typer.Argument(metavar="FOLDER", help="Depth images: 16-bit PNG or TIFF, or NPY.")],
     camera: CameraOption,
@@ -29,10 +39,7 @@ def reconstruct_command(
     unit: DepthUnitOption = None,
     poses: PosesOption = None,
     pattern: PatternOption = "*",
-    spacing: Annotated[
-        float | None,
-        typer.Option(help="Between points of the cloud, cm; by default that of neighbouring pixels on the plant."),
-    ] = None,
+    spacing: SpacingOption = None,
     folder: OutOption = Path("reconstruction"),
 ) -> None:
     """Make one cloud of a plant from depth images of it on a turntable, or from known viewpoints.
@@ -40,7 +47,7 @@ def reconstruct_command(
     The camera stands still and the plant turns, by about the same step between images, which are taken in the order of
     the numbers in their names. What turns is the plant; background, table and pot are removed. Axis and step are found
     from the images. Writes DIR/plant.ply (cm, z up, the number of views that saw each point), DIR/reconstruction.png
-    (three sides, to believe it by) and DIR/reconstruction.json (step, axis, the pose of each view, how well each pair
+    (look at it first) and DIR/reconstruction.json (step, axis, the pose of each view, how well each pair
     fits, views left out and why).
 
     Examples:
@@ -52,23 +59,15 @@ def reconstruct_command(
         phytofit reconstruct scan --camera realsense-d4xx --poses poses.json
     """
     from phytofit.reconstruct import reconstruct
-    from phytofit.results import check_reconstruction, prepare_folder, save_reconstruction
+    from phytofit.results import check_reconstruction, save_reconstruction
 
-    if images.is_dir() and images.resolve() == folder.resolve():
-        complain(f"{folder}: the folder of the images can't hold the results; name another with --out")
-        raise typer.Exit(2)
-    try:
-        prepare_folder(folder)
+    check_images(images)
+    if images.resolve() == folder.resolve():
+        raise InputError(f"{folder}: the folder of the images can't hold the results; name another with --out")
+    with results_in(folder):
         check_reconstruction(folder)
-        with Progress(
-            SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
-            console=err, transient=True, disable=not err.is_terminal,
-        ) as bar:  # fmt: skip
-            task = bar.add_task("images", total=STAGES)
-
-            def progress(stage: str) -> None:
-                bar.update(task, description=stage, advance=1)
-
+        stages = itertools.count()
+        with Items(1, "plant", in_stages=True).item(0, images.resolve().name) as told:
             result = reconstruct(
                 images,
                 camera,
@@ -77,13 +76,10 @@ def reconstruct_command(
                 poses=poses,
                 pattern=pattern,
                 spacing_cm=spacing,
-                progress=progress,
+                progress=lambda stage: told(stage, min(next(stages) / STAGES, 1.0)),
             )
-            save_reconstruction(result, folder)
-    except PhytofitError as error:
-        complain(error)
-        raise typer.Exit(2) from None
-    _print(result, folder)
+        save_reconstruction(result, folder)
+        _print(result, folder)
 
 
 def _print(result: "Reconstruction", folder: Path) -> None:
@@ -97,13 +93,15 @@ def _print(result: "Reconstruction", folder: Path) -> None:
         if best is None:
             table.add_row(for_terminal(file), angle, "", "", "")
         else:
-            other = for_terminal(result.files[best.second if best.first == i else best.first])
-            table.add_row(for_terminal(file), angle, other, f"{100 * best.overlap:.0f}", f"{best.residual_cm:.2f}")
-    out.print(table)
+            other = result.files[best.second if best.first == i else best.first]
+            table.add_row(
+                for_terminal(file), angle, for_terminal(other), f"{100 * best.overlap:.0f}", f"{best.residual_cm:.2f}"
+            )
+    show(table)
     for view in result.rejected:
-        out.print(f"[bold yellow]rejected:[/] {for_terminal(f'{view.file}: {view.reason}')}", highlight=False)
-    for text in result.flags:
-        flag(text)
+        remark("rejected", f"{view.file}: {view.reason}")
+    for flag in result.flags:
+        remark("flag", flag)
     said = [f"{len(result.cloud)} points of {len(result.files)} views"]
     if result.step_deg is not None:
         said.append(f"step {abs(result.step_deg):.2f}°")
@@ -111,5 +109,5 @@ def _print(result: "Reconstruction", folder: Path) -> None:
         said.append(f"neighbours {result.residual_cm:.2f} cm apart (median)")
     if result.loop is not None:
         said.append(f"loop closes within {result.loop[0]:.1f}° and {result.loop[1]:.2f} cm")
-    where = f"{folder / 'plant.ply'}; believe it by {folder / 'reconstruction.png'}"
-    tell(f"{', '.join(said)}: {where}")
+    where = f"{folder / 'plant.ply'}; check it in {folder / 'reconstruction.png'}"
+    say(f"{', '.join(said)}: {where}")

@@ -1,16 +1,19 @@
 """The command that measures whole plants."""
 
 import math
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.box import SIMPLE_HEAD
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from phytofit.cli.console import app, err, flag, note, or_exit, out, tell
+from phytofit.cli.console import command, complain, results_in, say, show, unforeseen
+from phytofit.cli.inputs import check_images, cloud_files, holds_images
+from phytofit.cli.messages import at_command_line
 from phytofit.cli.options import (
+    CAMERAS,
     CameraOption,
     DepthUnitOption,
     LabelsOption,
@@ -23,8 +26,12 @@ from phytofit.cli.options import (
     ThreadsOption,
     UnitsOption,
     UpOption,
+    only,
 )
+from phytofit.cli.progress import Items
 from phytofit.cli.settings import defaults_of
+from phytofit.cli.tables import print_remarks, print_skipped
+from phytofit.errors import InputError, PhytofitError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,12 +48,26 @@ SHOWN = {  # traits of each leaf on the screen, and their headings
     "leaf_azimuth": "azimuth",
     "collar_height": "collar at",
 }
-STAGE_NAMES = {"reconstruct": "cloud from the images", "segment": "stem and leaves", "fit": "fitting leaves"}
+STAGES = {  # their names, where they begin, and their share of a run's time
+    "reconstruct": ("cloud from the images", 0.0, 0.2),
+    "segment": ("stem and leaves", 0.2, 0.1),
+    "fit": ("leaves", 0.3, 0.7),
+}
+FOR_IMAGES = ("camera", "step", "unit", "poses", "pattern")
+FOR_CLOUDS = ("units", "labels")
 
 
-@app.command("run")
+@command("run")
 def run_command(
-    source: Annotated[Path, typer.Argument(help="Folder of depth images of a plant, or a cloud of it.")],
+    context: typer.Context,
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SOURCES",
+            help="Folders of depth images, one for each plant; or clouds of plants, folders of clouds, or patterns.",
+            show_default=False,
+        ),
+    ],
     camera: CameraOption = "",
     step: StepOption = None,
     unit: DepthUnitOption = None,
@@ -63,9 +84,9 @@ def run_command(
     """Measure all leaves of a plant, from depth images or from its cloud: reconstruct, segment, fit.
 
     Writes DIR/plant.png (look at it first: leaves coloured and numbered, beside their traits), DIR/traits.csv (plant,
-    internodes and leaves), and what each stage made: DIR/reconstruction, DIR/segmentation, DIR/leaves/leaf_01 and on. A
-    stage that is up to date is not done again. Where a leaf is wrong, edit the labels in DIR/segmentation/plant.ply and
-    run on that file with --labels label.
+    internodes and leaves), and what each stage made: DIR/reconstruction, DIR/segmentation, DIR/leaves/leaf_01 and on;
+    for several plants, all that in DIR/NAME, and DIR/traits.csv over all. A stage that is up to date is not done again.
+    Where a leaf is wrong, edit the labels in DIR/segmentation/plant.ply and run on that file with --labels label.
 
     Examples:
 
@@ -73,43 +94,95 @@ def run_command(
 
         phytofit run plant.ply --units mm --up z --out plant
 
+        phytofit run plants --units mm --up z --out plants_measured
+
         phytofit run plant/segmentation/plant.ply --units cm --labels label --out corrected
     """
+    plants, skipped = _plants(context, sources, folder)
+    settings: dict[str, Any] = {
+        "camera": camera or None,
+        "units": units,
+        "up": up,
+        "step_deg": step,
+        "unit": unit,
+        "poses": poses,
+        "pattern": pattern,
+        "labels": labels,
+        "species": species,
+        "seed": seed,
+        "threads": threads,
+    }
+    with results_in(folder):
+        print_skipped(skipped)
+        _run_all(plants, settings, folder)
+
+
+def _plants(context: typer.Context, sources: list[str], folder: Path) -> tuple[list[Path], list[Path]]:
+    """What to measure: folders of images, or clouds; and what was skipped.  The options for the one are refused for the
+    other."""
+    images = [Path(source) for source in sources if holds_images(Path(source))]
+    if not images:
+        only(context, FOR_IMAGES, "for a folder of depth images, and this is a point cloud; leave it out")
+        return cloud_files(sources)
+    if len(images) < len(sources):
+        raise InputError(f"{images[0]}: a folder of images among point clouds; measure them one after the other")
+    for source in images:
+        check_images(source)
+        if source.resolve() == folder.resolve():
+            raise InputError(f"{folder}: the folder of the images can't hold the results; name another with --out")
+    only(context, FOR_CLOUDS, "for point clouds, and this is a folder of images; leave it out")
+    if not context.params["camera"]:
+        raise InputError(f"{images[0]}: a folder of depth images needs --camera: {', '.join(CAMERAS)}, or a TOML file")
+    return images, []
+
+
+def _run_all(plants: list[Path], settings: dict[str, Any], folder: Path) -> None:
+    """Measure one plant after the other; what goes wrong with one does not keep the others from being measured."""
+    import pandas as pd
+
     from phytofit.pipeline import run
+    from phytofit.results import result_names, write_table
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task("images", total=1)
+    alone = len(plants) == 1
+    items = Items(len(plants), "plant", in_stages=True)
+    tables, n_without = [], 0
+    for i, (source, name) in enumerate(zip(plants, result_names(plants), strict=True)):
+        where = folder if alone else folder / name
+        try:
+            with items.item(i, name) as told:
+                made = run(source, where, **settings, progress=_stages(told))
+        except Exception as error:
+            said = at_command_line(error) if isinstance(error, PhytofitError) else unforeseen(error)
+            complain(said if str(source) in said or source.name in said else f"{source}: {said}")
+            continue
+        tables.append(made.table if alone else made.table.assign(cloud=name))
+        _print_plant(made)
+        if not (made.table["trait"] == "leaf_width").any():
+            complain(f"{source}: no leaf could be measured; look at {where / 'plant.png'}")
+            n_without += 1
+        say(f"Look at {where / 'plant.png'}; all traits: {where / 'traits.csv'}")
+    if tables and not alone:
+        write_table(folder / "traits.csv", pd.concat(tables))
+        say(f"{len(tables) - n_without} of {len(plants)} plants measured: {folder / 'traits.csv'}")
+    n_measured = len(tables) - n_without
+    raise typer.Exit(0 if n_measured == len(plants) else 1 if n_measured else 2)
 
-        def progress(stage: str, done: int, total: int) -> None:
-            bar.update(task, description=STAGE_NAMES[stage], completed=done, total=total)
 
-        made = or_exit(
-            lambda: run(
-                source,
-                folder,
-                camera=camera or None,
-                units=units,
-                up=up,
-                step_deg=step,
-                unit=unit,
-                poses=poses,
-                pattern=pattern,
-                labels=labels,
-                species=species,
-                seed=seed,
-                threads=threads,
-                progress=progress,
-            )
-        )
-    _print_plant(made)
-    tell(f"Look at {folder / 'plant.png'}; all traits: {folder / 'traits.csv'}")
+def _stages(told: Callable[[str, float], None]) -> Callable[[str, int, int], None]:
+    """Words for the stages of a run, and what share of it each takes, roughly."""
+
+    def progress(stage: str, done: int, total: int) -> None:
+        name, begins, share = STAGES[stage]
+        name = f"leaf {min(done + 1, total)} of {total}" if stage == "fit" and total else name
+        told(name, begins + share * done / max(total, 1))
+
+    return progress
 
 
 def _print_plant(made: "PlantRun") -> None:
     whole = made.table[made.table["organ"] == "plant"].set_index("trait")[["value", "unit"]].to_dict("index")
     said = [f"{str(trait).replace('_', ' ')} {row['value']:.3g} {row['unit']}" for trait, row in whole.items()]
-    tell(f"{made.segmentation.cloud.name}: {', '.join(said).replace(' 1,', ',')}")
+    say(f"{made.segmentation.cloud.name}: {', '.join(said).replace(' 1,', ',')}")
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for column in ("leaf", *SHOWN.values()):
         table.add_column(column, justify="right", no_wrap=True)
@@ -117,13 +190,10 @@ def _print_plant(made: "PlantRun") -> None:
     for rank, mine in leaves.groupby("rank"):
         of_leaf = mine.drop_duplicates("trait").set_index("trait")
         table.add_row(str(rank), *(_with_interval(of_leaf, trait) for trait in SHOWN))
-    out.print(table)
-    for text in made.notes:
-        note(text)
-    for text in made.flags:
-        flag(text)
+    show(table)
+    print_remarks(made.notes, made.flags)
     if made.skipped:
-        tell(f"up to date, not done again: {', '.join(made.skipped)}")
+        say(f"up to date, not done again: {', '.join(made.skipped)}")
 
 
 def _with_interval(traits: "pd.DataFrame", name: str) -> str:

@@ -9,7 +9,7 @@ import pkgutil
 from functools import cache
 from typing import Any
 
-__all__ = ["defaults_of", "entries_of"]
+__all__ = ["defaults_of", "entries_of", "value_of"]
 
 
 def defaults_of(module: str, function: str) -> dict[str, Any]:
@@ -29,6 +29,11 @@ def entries_of(module: str, name: str) -> dict[str, str]:
     _, node = _find(module, name)
     assert isinstance(node, ast.Dict)
     return {ast.literal_eval(key): ast.unparse(value) for key, value in zip(node.keys, node.values, strict=True) if key}
+
+
+def value_of(module: str, name: str) -> Any:
+    """A plain value that bears this name in ``phytofit.module``."""
+    return _value(module, ast.Name(name))
 
 
 def _value(module: str, node: ast.expr) -> Any:

@@ -9,8 +9,9 @@ from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from phytofit.cli.console import app, complain, err, note, or_exit, out, tell
+from phytofit.cli.console import command, err, out, remark, results_in, say, show
 from phytofit.cli.options import (
+    MOST_POINTS,
     NoiseOption,
     NoiseReachOption,
     OutliersOption,
@@ -21,8 +22,11 @@ from phytofit.cli.options import (
     SpheresOption,
     ThreadsOption,
     ViewsOption,
+    numeric,
+    only,
 )
 from phytofit.cli.settings import defaults_of
+from phytofit.errors import InputError, NoPhytomerError
 from phytofit.text import for_terminal
 
 if TYPE_CHECKING:
@@ -36,13 +40,31 @@ __all__ = ["validate_command"]
 
 SHOWN = ("n", "bias", "RMSE", "R", "CCC", "covered")  # of an agreement, on the screen
 SIMULATE = defaults_of("simulation", "simulate")
+OF_SIMULATION = (  # options that describe a sensor, and what is simulated
+    [
+        "points",
+        "noise",
+        "noise_reach",
+        "views",
+        "spheres",
+        "sphere_diameter",
+        "outliers",
+        "number",
+        "within",
+        "within_deg",
+        "species",
+        "seed",
+        "threads",
+    ]
+)
 SPECIES = defaults_of("species", "load_species")["species"]
 
 
-@app.command("validate")
+@command("validate")
 def validate_command(
+    context: typer.Context,
     results: Annotated[
-        Path | None, typer.Argument(help="Folder of results of `phytofit fit`, or its traits.csv.", show_default=False)
+        Path | None, typer.Argument(help="Folder of results of phytofit fit, or its traits.csv.", show_default=False)
     ] = None,
     truth: Annotated[
         Path | None,
@@ -51,16 +73,20 @@ def validate_command(
     simulated: Annotated[
         bool, typer.Option("--simulate", help="No results: simulated phytomers, seen by a sensor such as yours.")
     ] = False,
-    points: Annotated[int, typer.Option(help="Points your sensor gives of a phytomer.")] = SIMULATE["n_points"],
+    points: Annotated[int, numeric("Points your sensor gives of a phytomer.", least=1, most=MOST_POINTS)] = SIMULATE[
+        "n_points"
+    ],
     noise: NoiseOption = SIMULATE["noise_cm"],
     noise_reach: NoiseReachOption = SIMULATE["noise_reach_cm"],
     views: ViewsOption = SIMULATE["n_views"],
     spheres: SpheresOption = SIMULATE["n_spheres"],
     sphere_diameter: SphereDiameterOption = SIMULATE["sphere_diameter_cm"],
     outliers: OutliersOption = SIMULATE["outlier_share"],
-    number: Annotated[int, typer.Option("--number", "-n", help="How many phytomers a step.", min=3)] = 30,
-    within: Annotated[float, typer.Option(help="How near the truth lengths should be, %.", min=0.0)] = 5.0,
-    within_deg: Annotated[float, typer.Option(help="How near the truth the leaf angle should be, degrees.")] = 3.0,
+    number: Annotated[
+        int, numeric("How many phytomers for each setting of the sensor.", "--number", "-n", least=3, most=9999)
+    ] = 30,
+    within: Annotated[float, numeric("How near the truth lengths should be, %.", least=0)] = 5.0,
+    within_deg: Annotated[float, numeric("How near the truth the leaf angle should be, degrees.", least=0)] = 3.0,
     species: SpeciesOption = SPECIES,
     seed: Seed = SIMULATE["seed"],
     threads: ThreadsOption = None,
@@ -81,17 +107,16 @@ def validate_command(
 
         phytofit validate --simulate --noise 0.3 --points 2000 --views 3 --spheres 1
     """
-    from phytofit.results import prepare_folder
     from phytofit.simulation import simulate
     from phytofit.species import load_species
 
     if simulated in (truth is not None, results is not None):
-        complain(
-            "expected a folder of results with --truth measurements.csv, or --simulate without either: "
+        raise InputError(
+            "expected a folder of results with --truth measurements.csv, or --simulate without either; "
             "see phytofit validate --help"
         )
-        raise typer.Exit(2)
     if results is not None and truth is not None:
+        only(context, OF_SIMULATION, "for --simulate; leave it out with --truth")
         _against_the_hand(results, truth, folder)
         return
     sensor: dict[str, Any] = {
@@ -103,39 +128,40 @@ def validate_command(
         "sphere_diameter_cm": sphere_diameter,
         "outlier_share": outliers,
     }
-    chosen = or_exit(lambda: load_species(species))
+    chosen = load_species(species)
     checked = {**sensor, "n_spheres": min(spheres, 0)}  # how many points spheres leave differs from leaf to leaf
-    or_exit(lambda: simulate(chosen, seed=seed, **checked))
-    or_exit(lambda: prepare_folder(folder))
-    trials = or_exit(lambda: _tried(sensor, chosen, number, seed, threads))
-    base = trials["the sensor"][0]
-    if base.comparison.pairs.empty:
-        complain(f"none of the {number} simulated clouds could be fitted: {base.comparison.unmatched[0]}")
-        raise typer.Exit(2)
-    _tell(base, {name: made for name, made in trials.items() if name != "the sensor"}, within, within_deg, folder)
+    simulate(chosen, seed=seed, **checked)
+    with results_in(folder):
+        trials = _tried(sensor, chosen, number, seed, threads)
+        base = trials["the sensor"][0]
+        if base.comparison.pairs.empty:
+            raise NoPhytomerError(
+                f"none of the {number} simulated clouds could be fitted: {base.comparison.unmatched[0]}"
+            )
+        _tell(base, {name: made for name, made in trials.items() if name != "the sensor"}, within, within_deg, folder)
 
 
 def _against_the_hand(results: Path, truth: Path, folder: Path) -> None:
     from phytofit.report import agreement_page
-    from phytofit.results import prepare_folder
     from phytofit.validation import agreement, compare, read_measures, read_results
 
-    measures = or_exit(lambda: read_measures(truth))
-    comparison = or_exit(lambda: compare(measures, read_results(results)))
+    measures = read_measures(truth)
+    comparison = compare(measures, read_results(results))
     found = agreement(comparison.pairs)
-    for text in (*comparison.notes, *comparison.unmatched):
-        note(text)
     if not found:
-        complain(f"{truth}: none of its clouds and traits is among those of {results}; are the clouds' names the same?")
-        raise typer.Exit(2)
-    or_exit(lambda: prepare_folder(folder))
-    page = agreement_page(comparison, found, f"Results in {results.name} against {truth.name}")
-    _write(folder, comparison.pairs, found, page)
-    _show(found, f"{results} against {truth.name}")
-    for a in found:
-        if a.outliers:
-            note(f"{a.trait} is far off in {', '.join(a.outliers)}")
-    tell(f"With plots: {folder / 'validation.html'}")
+        raise InputError(
+            f"{truth}: none of its clouds and traits is among those of {results}; are the clouds' names the same?"
+        )
+    with results_in(folder):
+        for text in (*comparison.notes, *comparison.unmatched):
+            remark("note", text)
+        page = agreement_page(comparison, found, f"Results in {results.name} against {truth.name}")
+        _write(folder, comparison.pairs, found, page)
+        _show(found, f"{results} against {truth.name}")
+        for a in found:
+            if a.outliers:
+                remark("note", f"{a.trait} is far off in {', '.join(a.outliers)}")
+        say(f"With plots: {folder / 'validation.html'}")
 
 
 def _tried(
@@ -150,7 +176,9 @@ def _tried(
     }
     runs = 1 + sum(value != sensor[name] for name, values in steps.items() for value in values)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, TimeRemainingColumn(), console=err, transient=True, disable=not err.is_terminal) as bar:
+    with Progress(
+        *columns, TimeRemainingColumn(), console=err, transient=True, disable=not err.is_terminal or out.quiet
+    ) as bar:
         task = bar.add_task("simulated phytomers", total=runs * number)
 
         def done() -> None:
@@ -193,8 +221,8 @@ def _tell(
     _write(folder, base.comparison.pairs, found, page, needs=needs)
     _show(found, title)
     for text in (*base.comparison.unmatched, *answers):
-        tell(text)
-    tell(f"With plots: {folder / 'validation.html'}")
+        say(text)
+    say(f"With plots: {folder / 'validation.html'}")
 
 
 def _described(sensor: Mapping[str, Any]) -> str:
@@ -217,8 +245,7 @@ def _write(
     from phytofit.results import save_validation
 
     statistics = pd.DataFrame(found).assign(outliers=["; ".join(a.outliers) for a in found])
-    tables = {"pairs": pairs, "validation": statistics, **others}
-    or_exit(lambda: save_validation(folder, tables, page))
+    save_validation(folder, {"pairs": pairs, "validation": statistics, **others}, page)
 
 
 def _show(found: "Sequence[Agreement]", title: str) -> None:
@@ -230,5 +257,5 @@ def _show(found: "Sequence[Agreement]", title: str) -> None:
         table.add_column(column, justify="left" if column == "trait" else "right", no_wrap=True)
     for name, row in zip(shown.index, shown[list(SHOWN)].to_numpy(), strict=True):
         table.add_row(str(name), *row)
-    out.print(table)
-    tell(f"{max(a.flagged for a in found)} of {max(a.n for a in found)} results flagged")
+    show(table)
+    say(f"{max(a.flagged for a in found)} of {max(a.n for a in found)} results flagged")

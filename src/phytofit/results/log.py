@@ -32,6 +32,9 @@ class _OneLine(logging.Formatter):
 def open_log(folder: Path) -> Iterator[Path | None]:
     """Append what is logged to ``folder/phytofit.log`` meanwhile: its path, or None where that can't be written."""
     path = folder / FILE
+    if str(path.resolve()) in (handler.baseFilename for handler in LOG.handlers if isinstance(handler, _Quiet)):
+        yield path  # it is open
+        return
     before = LOG.level
     try:
         handler = _Quiet(path, encoding="utf-8", errors="backslashreplace")
