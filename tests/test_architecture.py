@@ -37,7 +37,7 @@ LAYERS = [
     {"models"},
     {"cloud"},
     {"kernels"},
-    {"ordering", "parameters", "parsing"},
+    {"ordering", "parameters", "parsing", "small_files"},
     {"bundled", "errors", "silence", "text"},
 ]
 DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}

@@ -16,9 +16,10 @@ import turntable_scene as scene
 from phytofit.cli import app
 from phytofit.errors import InputError, OutputError, SettingError
 from phytofit.reconstruct.depth import read_poses
+from phytofit.reconstruct.depth_files import depth_files, read_views
 from phytofit.reconstruct.plant import bodies, find_support, seen_through
 from phytofit.reconstruct.registration import Surface, exp_pose, log_pose, move_points, register
-from phytofit.reconstruct.views import depth_files, drop_flying_pixels, read_views, surface_normals
+from phytofit.reconstruct.views import drop_flying_pixels, surface_normals
 
 REAL = Path(__file__).parents[2] / "shared" / "data" / "mccormick2016_turntable"
 N_VIEWS = 12
@@ -207,10 +208,10 @@ class TestBadInput:
         ("image", "said"),
         [
             (np.zeros((264, 320), np.uint8), "view_1.png: found an image of 8 bits"),
-            (np.zeros((264, 320, 3), np.uint8), "view_1.png: found an image of 8 bits"),
+            (np.zeros((264, 320, 3), np.uint8), "view_1.png: found a picture in colours"),
             (
                 np.full((100, 90), 900, np.uint16),
-                "found 90 x 100 pixels, expected 320 x 264 as in view_0",
+                "view_1.png: found 90 x 100 pixels, expected 320 x 264 of the camera test",
             ),
         ],
     )
@@ -229,14 +230,17 @@ class TestBadInput:
             read_views([tmp_path / "view_0.png"], scene.CAMERA)
 
     def test_a_wrong_unit(self, folder):
-        with pytest.raises(InputError, match=r"median depth .* cm if stored in m, expected .* say --depth-unit"):
+        with pytest.raises(
+            InputError,
+            match=r"median depth is .* cm if it is stored in steps of 1 m, expected",
+        ):
             phytofit.reconstruct(folder, scene.CAMERA, unit="m")
 
     def test_npy_and_tiff_are_read_like_png(self, scan, tmp_path):
         write_images(tmp_path, scan.images[:1])
         Image.fromarray(scan.images[0]).save(tmp_path / "view_1.tif")
         np.save(tmp_path / "view_2.npy", scan.images[0].astype(np.float32))
-        views = read_views(depth_files(tmp_path), scene.CAMERA)
+        views, _ = read_views(depth_files(tmp_path), scene.CAMERA)
         assert len(views) == 3
         for view in views:
             assert view.depth == pytest.approx(0.1 * scan.images[0])
@@ -252,7 +256,7 @@ class TestBadInput:
 
     def test_wrong_intrinsics_are_refused(self, folder):
         wrong = replace(scene.CAMERA, fx=0.75 * scene.CAMERA.fx, fy=0.75 * scene.CAMERA.fy)
-        with pytest.raises(InputError, match=r"views don't fit each other.*is --camera"):
+        with pytest.raises(InputError, match=r"views don't fit each other.*is the camera"):
             phytofit.reconstruct(folder, wrong, step_deg=31.0)
 
     def test_a_plant_that_fills_the_frame(self, scan, tmp_path):
@@ -264,7 +268,7 @@ class TestBadInput:
 
     @pytest.mark.parametrize("step", [0.0, 200.0, np.nan])
     def test_impossible_steps(self, step, folder):
-        with pytest.raises(SettingError, match="--step"):
+        with pytest.raises(SettingError, match="step_deg"):
             phytofit.reconstruct(folder, scene.CAMERA, step_deg=step)
 
 
@@ -294,7 +298,7 @@ class TestCamera:
             ("fx = 1\nfy = 1\ncx = 1\ncy = 1\nwidth = 9\nheight = 9\nfocal = 2\n", "focal is unknown"),
             ("fx = 0\nfy = 1\ncx = 1\ncy = 1\nwidth = 9\nheight = 9\n", "above 0"),
             ("fx = 1\nfy = 1\ncx = 10\ncy = 1\nwidth = 9\nheight = 9\n", "inside an image of 9 x 9"),
-            ("fx = 'a'\nfy = 1\ncx = 1\ncy = 1\nwidth = 9\nheight = 9\n", "expected numbers"),
+            ("fx = 'a'\nfy = 1\ncx = 1\ncy = 1\nwidth = 9\nheight = 9\n", "should be a valid number"),
             ("fx : 3", "not a TOML file"),
         ],
     )

@@ -156,7 +156,7 @@ CameraOption = Annotated[
     str,
     choice(
         f"The depth camera: {', '.join(CAMERAS)}; or a TOML file with fx fy cx cy width height (pixels) and, where "
-        "needed, depth_scale, unit, distortion = \\[k1, k2, p1, p2, k3].",
+        "needed, depth_scale, unit, near and far, distortion = \\[k1, k2, p1, p2, k3].",
         "--camera",
         "-c",
         among=CAMERAS,

@@ -100,6 +100,8 @@ def _print(result: "Reconstruction", folder: Path) -> None:
     show(table)
     for view in result.rejected:
         remark("rejected", f"{view.file}: {view.reason}")
+    for note in result.cloud.notes:
+        remark("note", note)
     for flag in result.flags:
         remark("flag", flag)
     said = [f"{len(result.cloud)} points of {len(result.files)} views"]

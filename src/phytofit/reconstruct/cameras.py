@@ -1,21 +1,25 @@
 """Pinhole cameras: intrinsics by name or from a TOML file, pixels to rays and back."""
 
 import math
-import tomllib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from phytofit.cloud import SCALE_CM
 from phytofit.errors import InputError, SettingError
+from phytofit.small_files import read_toml, shortened
 
 __all__ = ["CAMERAS", "Camera", "load_camera"]
 
 FloatArray = NDArray[np.float64]
 UNITS = ("mm", "cm", "m")
+FARTHEST_CM = 1000.0  # that a depth is believed, where the camera does not say how far it sees
+MOST = 1e9  # of any number in a camera file; larger ones are slips
+MOST_PIXELS = 30_000  # along a side
 UNDISTORT_ROUNDS = 30  # of the fixed-point iteration; the lenses of depth cameras need about ten
 
 
@@ -24,7 +28,8 @@ class Camera:
     """A depth camera: x to the right, y down, z forward; depth is along z, not along the ray.
 
     ``fx fy cx cy`` are pixels, the first pixel's centre being (0, 0); ``width height`` pixels; one step of a stored
-    depth is ``depth_scale`` ``unit``; ``distortion`` is k1, k2, p1, p2, k3 as OpenCV counts them.
+    depth is ``depth_scale`` ``unit``; ``distortion`` is k1, k2, p1, p2, k3 as OpenCV counts them.  Depths nearer than
+    ``near`` or farther than ``far``, in ``unit``, are no measurements; by default those beyond 10 m are none.
 
     Raises
     ------
@@ -42,6 +47,8 @@ class Camera:
     unit: str = "mm"
     distortion: tuple[float, ...] = ()
     name: str = "camera"
+    near: float = 0.0
+    far: float | None = None
 
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, self.depth_scale, *self.distortion)
@@ -57,8 +64,11 @@ class Camera:
                 f"camera {self.name}: expected cx, cy inside an image of {self.width} x {self.height} pixels, "
                 f"got {self.cx:g}, {self.cy:g}; are the intrinsics those of another resolution?"
             )
+        low, high = self.range_cm
+        if not 0.0 <= low < high < math.inf:
+            raise SettingError(f"camera {self.name}: expected 0 <= near < far, got {self.near:g} and {self.far}")
         if self.unit not in UNITS:
-            raise SettingError(f"camera {self.name}: expected unit mm, cm or m, got {self.unit!r}")
+            raise SettingError(f"camera {self.name}: expected unit mm, cm or m, got {shortened(repr(self.unit))}")
         if len(self.distortion) > 5:
             raise SettingError(
                 f"camera {self.name}: expected distortion = [k1, k2, p1, p2, k3], got {len(self.distortion)} numbers"
@@ -68,6 +78,12 @@ class Camera:
     def step_cm(self) -> float:
         """What a stored depth of 1 is, cm."""
         return self.depth_scale * SCALE_CM[self.unit]
+
+    @property
+    def range_cm(self) -> tuple[float, float]:
+        """The nearest and the farthest depth that is a measurement, cm."""
+        to_cm = SCALE_CM.get(self.unit, 1.0)
+        return self.near * to_cm, FARTHEST_CM if self.far is None else self.far * to_cm
 
     def pitch(self, depth: float) -> float:
         """Distance of neighbouring pixels on a surface that faces the camera at this depth, in the depth's unit."""
@@ -112,12 +128,44 @@ PRESETS = {  # fx fy cx cy width height; typical units, without distortion: a ca
     "realsense-d4xx": (424.0, 424.0, 423.5, 239.5, 848, 480),  # D435 and D455 at 848 x 480
     "azure-kinect": (504.0, 504.0, 320.0, 333.0, 640, 576),  # narrow field of view, unbinned
 }
-CAMERAS = {name: Camera(*numbers, name=name) for name, numbers in PRESETS.items()}
-NEEDED = ("fx", "fy", "cx", "cy", "width", "height")
+RANGES_MM = {  # nearest and farthest depth that the sensor gives
+    "kinect-v1": (400.0, 8000.0),  # Kinect for Windows SDK 1.8: from 0.4 m in near mode; up to 8 m, beyond 4 m coarsely
+    "kinect-v2": (500.0, 8000.0),  # Kinect for Windows SDK 2.0: from 0.5 m; up to 8 m, beyond 4.5 m unreliably
+    "realsense-d4xx": (195.0, 10_000.0),  # Intel's data sheet of the D400 series: least depth at 848 x 480; about 10 m
+    "azure-kinect": (500.0, 3860.0),  # Microsoft's hardware specification, of that mode
+}
+CAMERAS = {
+    name: Camera(*numbers, near=RANGES_MM[name][0], far=RANGES_MM[name][1], name=name)
+    for name, numbers in PRESETS.items()
+}
+EXPECTED = (
+    "a camera: fx fy cx cy width height, in pixels, and maybe depth_scale unit near far distortion, in lines like "
+    "'fx = 365.0'"
+)
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MOST, le=MOST)]  # no text, no true or false
+Whole = Annotated[int, Field(strict=True, ge=1, le=MOST_PIXELS)]
+
+
+class _File(BaseModel):
+    """What a camera's TOML file may hold."""
+
+    model_config = ConfigDict(extra="forbid")
+    fx: Number
+    fy: Number
+    cx: Number
+    cy: Number
+    width: Whole
+    height: Whole
+    depth_scale: Number = 1.0
+    unit: Annotated[str, Field(strict=True)] = "mm"
+    near: Number | None = None
+    far: Number | None = None
+    distortion: Annotated[list[Number], Field(max_length=5)] = []
 
 
 def load_camera(name: str) -> Camera:
-    """A camera of `CAMERAS` by its name, or from a TOML file: fx fy cx cy width height, depth_scale, unit, distortion.
+    """A camera of `CAMERAS` by its name, or from a TOML file: fx fy cx cy width height, and maybe depth_scale, unit,
+    near and far in that unit, and distortion.
 
     Raises
     ------
@@ -130,34 +178,25 @@ def load_camera(name: str) -> Camera:
         return CAMERAS[name]
     path = Path(name)
     if path.suffix.lower() != ".toml":
-        raise InputError(f"--camera {name}: expected {', '.join(CAMERAS)}, or a TOML file with {' '.join(NEEDED)}")
-    try:
-        given: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: can't be read ({error.strerror}); expected a TOML file of a camera") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not a TOML file ({error}); expected lines like 'fx = 365.0'") from None
-    known = {field.name for field in fields(Camera)} - {"name"}
-    missing, unknown = [key for key in NEEDED if key not in given], sorted(set(given) - known)
-    if missing or unknown:
-        wrong = [f"{key} is missing" for key in missing] + [f"{key} is unknown" for key in unknown]
-        expected = f"{' '.join(NEEDED)}, and maybe depth_scale unit distortion"
-        raise SettingError(f"{path}: {', '.join(wrong)}; expected {expected}")
-    try:
-        fx, fy, cx, cy = (float(given[key]) for key in NEEDED[:4])
-        return Camera(
-            fx,
-            fy,
-            cx,
-            cy,
-            int(given["width"]),
-            int(given["height"]),
-            depth_scale=float(given.get("depth_scale", 1.0)),
-            unit=str(given.get("unit", "mm")),
-            distortion=tuple(float(k) for k in given.get("distortion", ())),
-            name=path.stem,
+        known = ", ".join(CAMERAS)
+        raise InputError(
+            f"{shortened(name)}: no camera known by that name; expected {known}, or a TOML file of {EXPECTED}"
         )
-    except (TypeError, ValueError) as error:
-        if isinstance(error, SettingError):
-            raise
-        raise SettingError(f"{path}: expected numbers ({error})") from None
+    given = read_toml(path, EXPECTED)
+    try:
+        read = _File.model_validate(given).model_dump(exclude_none=True)
+    except (ValidationError, OverflowError) as error:
+        raise SettingError(f"{path}: {_first(error)}; expected {EXPECTED}") from None
+    return Camera(**{**read, "distortion": tuple(read["distortion"])}, name=path.stem)
+
+
+def _first(error: ValidationError | OverflowError) -> str:
+    """The first thing that is wrong, in words."""
+    if isinstance(error, OverflowError):
+        return "a number is too large"
+    first = error.errors(include_url=False)[0]
+    key = shortened(".".join(str(part) for part in first["loc"]))
+    if first["type"] in ("missing", "extra_forbidden"):
+        return f"{key} is {'missing' if first['type'] == 'missing' else 'unknown'}"
+    what = first["msg"][0].lower() + first["msg"][1:]
+    return f"{key} = {shortened(repr(first['input']))}: {what}"

@@ -1,6 +1,5 @@
 """Depth images of a plant, on a turntable or from known viewpoints, to one cloud: read, register, fuse, judge."""
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,22 +12,18 @@ from threadpoolctl import threadpool_limits
 from phytofit.cloud import MIN_POINTS, SCALE_CM, PointCloud
 from phytofit.errors import InputError, SettingError
 from phytofit.reconstruct.cameras import Camera, load_camera
+from phytofit.reconstruct.depth_files import DepthView, depth_files, read_views
 from phytofit.reconstruct.fusion import fuse
 from phytofit.reconstruct.placing import Placed, Rejected, Views, place_by_poses, place_on_turntable
 from phytofit.reconstruct.registration import Pair, move_points
 from phytofit.reconstruct.turntable import Turn
-from phytofit.reconstruct.views import (
-    DepthView,
-    depth_files,
-    drop_flying_pixels,
-    read_views,
-    surface_normals,
-    view_points,
-)
+from phytofit.reconstruct.views import drop_flying_pixels, surface_normals, view_points
+from phytofit.small_files import read_json, shortened
 
 __all__ = ["Reconstruction", "read_poses", "reconstruct"]
 
 FloatArray = NDArray[np.float64]
+POSES = '{"unit": "cm", "views": [{"file": "a.png", "pose": 4x4}, ...]}'
 LEAST_RETURNS = 0.01  # share of an image's pixels; below, the image is empty
 DOUBTFUL, REFUSED = 0.15, 0.4  # shares of points that other views see through; right poses leave some per cent
 
@@ -104,15 +99,17 @@ def reconstruct(
     SettingError
         If a setting is out of its range.
     """
+    if poses is not None and step_deg is not None:
+        raise SettingError("step_deg: it is for a turntable, and known poses were given; leave one of the two out")
     if step_deg is not None and not 1.0 <= abs(step_deg) <= 180.0:
-        raise SettingError(f"--step {step_deg:g}: expected degrees between two views, 1 to 180")
+        raise SettingError(f"step_deg: expected degrees between two views, 1 to 180, got {step_deg:g}")
     if spacing_cm is not None and not 0.01 <= spacing_cm <= 5.0:
-        raise SettingError(f"--spacing {spacing_cm:g}: expected 0.01 to 5 cm")
+        raise SettingError(f"spacing_cm: expected 0.01 to 5 cm, got {spacing_cm:g}")
     chosen = load_camera(camera) if isinstance(camera, str) else camera
     folder = Path(folder)
     progress("images")
     files = depth_files(folder, pattern)
-    images = read_views(files, chosen, unit=unit)
+    images, notes = read_views(files, chosen, unit=unit)
     given = None if poses is None else read_poses(Path(poses), [image.file for image in images])
     views = _usable(images, chosen)
     settings = {"step_deg": step_deg, "unit": unit or chosen.unit, "poses": None if poses is None else Path(poses).name,
@@ -123,7 +120,7 @@ def reconstruct(
         else:
             placed = place_on_turntable(views, chosen, step_deg, progress)
         progress("fusion")
-        return _fused(views, placed, chosen, spacing_cm, folder, settings)
+        return _fused(views, placed, chosen, spacing_cm, folder, settings, notes)
 
 
 def read_poses(path: Path, files: Sequence[str]) -> dict[str, FloatArray]:
@@ -137,17 +134,12 @@ def read_poses(path: Path, files: Sequence[str]) -> dict[str, FloatArray]:
     InputError
         If the file can't be read, a view has no pose, or a pose is no rotation and translation.
     """
+    found = read_json(path, POSES)
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
         scale = SCALE_CM[found["unit"]]
         read = {str(view["file"]): np.array(view["pose"], dtype=float) for view in found["views"]}
-    except OSError as error:
-        raise InputError(f"{path}: can't be read ({error.strerror}); expected a JSON file of poses") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: not a file of poses ({error!r}); expected "
-            '{"unit": "cm", "views": [{"file": ..., "pose": 4x4}]}'
-        ) from None
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise InputError(f"{path}: not a file of poses ({shortened(repr(error))}); expected {POSES}") from None
     for name in files:
         if name not in read:
             raise InputError(f"{path}: no pose for {name}, found {len(read)} poses; name each image file once")
@@ -180,7 +172,13 @@ def _usable(images: Sequence[DepthView], camera: Camera) -> Views:
 
 
 def _fused(
-    views: Views, placed: Placed, camera: Camera, spacing_cm: float | None, folder: Path, settings: dict[str, Any]
+    views: Views,
+    placed: Placed,
+    camera: Camera,
+    spacing_cm: float | None,
+    folder: Path,
+    settings: dict[str, Any],
+    notes: tuple[str, ...],
 ) -> Reconstruction:
     rays = camera.rays()
     points, normals, view, distances = [], [], [], []
@@ -207,7 +205,7 @@ def _fused(
     )
     if fused.contradicted > DOUBTFUL:
         said = f"{100 * fused.contradicted:.0f} % of the points are seen through by other views, expected a few"
-        asked = f"is --camera ({camera.name}, f = {camera.fx:g} pixels) right, and did the leaves keep still?"
+        asked = f"is the camera ({camera.name}, f = {camera.fx:g} pixels) right, and did the leaves keep still?"
         if fused.contradicted > REFUSED:
             raise InputError(f"{folder}: the views don't fit each other: {said}; {asked}")
         views.flags.append(f"{said}; {asked}")
@@ -216,7 +214,7 @@ def _fused(
         poses[:, 2, 3] -= kept[:, 2].min()
         kept = kept - [0.0, 0.0, kept[:, 2].min()]
     return Reconstruction(
-        cloud=PointCloud(kept, normals=fused.normals, name=folder.resolve().name),
+        cloud=PointCloud(kept, normals=fused.normals, name=folder.resolve().name, notes=notes),
         view=fused.view,
         n_views=fused.n_views,
         camera=camera,

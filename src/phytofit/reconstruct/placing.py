@@ -319,7 +319,7 @@ def _believe(pairs: Sequence[Pair], camera: Camera) -> None:
         raise InputError(
             f"the views don't fit each other: neighbours overlap by {100 * overlap:.0f} % with {residual:.2f} cm "
             f"between them, expected at least {100 * LEAST_OVERLAP:.0f} % and at most {MOST_RESIDUAL_CM:g} cm; is "
-            f"--camera ({camera.name}, f = {camera.fx:g} pixels) right, are the views in order and steps not above 60°?"
+            f"the camera ({camera.name}, f = {camera.fx:g} pixels) right, are views in order, and steps at most 60°?"
         )
 
 

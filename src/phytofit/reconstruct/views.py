@@ -1,137 +1,14 @@
-"""Depth images: read, checked, freed of flying pixels, turned into points with normals."""
-
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+"""Depth images freed of flying pixels, and turned into points with normals."""
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 from scipy.spatial import cKDTree
 
-from phytofit.cloud import SCALE_CM
-from phytofit.errors import InputError
 from phytofit.reconstruct.cameras import Camera
 
-__all__ = ["DepthView", "depth_files", "drop_flying_pixels", "read_views", "surface_normals", "view_points"]
+__all__ = ["drop_flying_pixels", "surface_normals", "view_points"]
 
 FloatArray = NDArray[np.float64]
-SUFFIXES = (".png", ".tif", ".tiff", ".npy")
-DEEP_MODES = ("I;16", "I;16B", "I;16L", "I;16N", "I", "F")  # Pillow's names of images with 16 bits and more
-PLAUSIBLE_CM = (10.0, 1000.0)  # median depth of an image that shows a plant
-
-
-@dataclass(frozen=True, eq=False)
-class DepthView:
-    """One depth image: ``depth`` (height, width) in cm, 0 where nothing came back; ``file`` is its name."""
-
-    file: str
-    depth: FloatArray
-
-
-def depth_files(folder: Path, pattern: str = "*") -> list[Path]:
-    """The depth images of a folder in the order of the numbers in their names; InputError if there is none."""
-    if not folder.is_dir():
-        found = "is a file" if folder.exists() else "no such folder"
-        raise InputError(f"{folder}: {found}, expected a folder of depth images")
-    try:
-        files = [path for path in folder.glob(pattern) if path.suffix.lower() in SUFFIXES and path.is_file()]
-    except (NotImplementedError, ValueError) as error:  # an absolute pattern, or none
-        raise InputError(
-            f"--pattern {pattern}: expected one such as 'depth_*.png', within the folder ({error})"
-        ) from None
-    if not files:
-        raise InputError(f"{folder}: no depth images found (pattern {pattern!r}), expected {', '.join(SUFFIXES)} files")
-    return sorted(files, key=_natural)
-
-
-def _natural(path: Path) -> list[tuple[int, int, str]]:
-    parts = re.split(r"(\d+)", path.name)
-    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
-
-
-def read_views(files: Sequence[Path], camera: Camera, *, unit: str | None = None) -> list[DepthView]:
-    """Read depth images: 16-bit PNG or TIFF, or NPY.
-
-    Parameters
-    ----------
-    files
-        In the order in which they were taken.
-    camera
-        The size of the images has to be the camera's; it says what a stored step is, too.
-    unit
-        What a stored depth of 1 is: mm, cm or m; by default the camera's.
-
-    Raises
-    ------
-    InputError
-        If a file can't be read, is no depth image, has another size, or its depths are not those of a plant.
-    """
-    if unit is not None and unit not in ("mm", "cm", "m"):
-        raise InputError(f"--depth-unit {unit}: expected mm, cm or m")
-    step_cm = camera.step_cm if unit is None else SCALE_CM[unit]
-    stored = [_stored(path) for path in files]
-    shapes = [image.shape for image in stored]
-    for path, shape in zip(files, shapes, strict=True):
-        if shape != shapes[0]:
-            raise InputError(
-                f"{path.name}: found {shape[1]} x {shape[0]} pixels, expected {shapes[0][1]} x {shapes[0][0]} as in "
-                f"{files[0].name}; all views have to come from one camera at one resolution"
-            )
-        if shape != (camera.height, camera.width):
-            raise InputError(
-                f"{path.name}: found {shape[1]} x {shape[0]} pixels, expected {camera.width} x {camera.height} of the "
-                f"camera {camera.name}; name the right camera with --camera"
-            )
-    views = []
-    for path, image in zip(files, stored, strict=True):
-        with np.errstate(invalid="ignore", over="ignore"):
-            depth = np.nan_to_num(image.astype(float), nan=0.0, posinf=0.0, neginf=0.0) * step_cm
-        if (depth < 0).any():
-            raise InputError(f"{path.name}: found negative depths, expected distances, and 0 where nothing came back")
-        views.append(DepthView(path.name, depth))
-    _check_range(views, unit or camera.unit)
-    return views
-
-
-def _stored(path: Path) -> NDArray[Any]:
-    try:
-        if path.suffix.lower() == ".npy":
-            image = np.load(path, allow_pickle=False)
-        else:
-            with Image.open(path) as opened:
-                if opened.mode not in DEEP_MODES:
-                    raise InputError(
-                        f"{path.name}: found an image of 8 bits or colours ({opened.mode}), expected 16-bit depth; "
-                        "export depth without scaling to grey levels, or choose files with --pattern 'Depth*.png'"
-                    )
-                image = np.array(opened)
-    except InputError:
-        raise
-    except (OSError, ValueError, EOFError, SyntaxError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path.name}: can't be read ({error}); expected a 16-bit PNG or TIFF, or NPY") from None
-    if image.ndim != 2 or image.dtype.kind not in "uif" or image.dtype.itemsize < 2:
-        raise InputError(
-            f"{path.name}: found an array of shape {image.shape} and type {image.dtype}, "
-            "expected (height, width) of 16-bit whole numbers or floats"
-        )
-    return np.asarray(image)
-
-
-def _check_range(views: Sequence[DepthView], unit: str) -> None:
-    seen = [view.depth[view.depth > 0] for view in views]
-    everything = np.concatenate(seen)
-    if not len(everything):
-        raise InputError("all views are empty (all depths 0); was depth recorded?")
-    median = float(np.median(everything))
-    low, high = PLAUSIBLE_CM
-    if not low <= median <= high:
-        raise InputError(
-            f"{views[0].file} and the others: median depth {median:.3g} cm if stored in {unit}, expected "
-            f"{low:g} to {high:g} cm; say --depth-unit mm, cm or m"
-        )
 
 
 def drop_flying_pixels(

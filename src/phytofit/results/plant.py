@@ -115,6 +115,7 @@ def _as_json(result: Reconstruction) -> dict[str, Any]:
         "contradicted_share": result.contradicted,
         "rejected": [{"file": view.file, "reason": view.reason} for view in result.rejected],
         "flags": list(result.flags),
+        "notes": list(result.cloud.notes),
         "settings": result.settings,
     }
 

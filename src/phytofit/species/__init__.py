@@ -3,21 +3,24 @@
 import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from phytofit.bundled import species_folder, species_names
-from phytofit.errors import SettingError, SpeciesError
+from phytofit.errors import InputError, SettingError, SpeciesError
 from phytofit.models.phytomer import N_PAPER, Phytomer
 from phytofit.parameters import Parameter, ParameterSpace
+from phytofit.small_files import read_toml, shortened
+from phytofit.text import one_line
 
 __all__ = ["STEM_ABOVE", "Species", "load_species"]
 
 STEM_ABOVE = {"equal": 1.0, "none": 0.0, "free": np.nan}  # times as long as below the leaf
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]  # no text, no true or false
+MOST = 1e6  # of any number, cm or deg; larger ones are slips, and overflow where they are squared
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MOST, le=MOST)]  # no text, no true or false
 
 
 @dataclass(frozen=True)
@@ -81,29 +84,25 @@ def load_species(species: str | Path = "sorghum") -> Species:
     from any one on.  Raises SpeciesError, which names the file, the key, and what was expected.
     """
     if str(species) in species_names():
-        text, where = species_folder().joinpath(f"{species}.toml").read_text(encoding="utf-8"), f"{species}.toml"
+        given, where = tomllib.loads(species_folder().joinpath(f"{species}.toml").read_text(encoding="utf-8")), species
     else:
-        text, where = _read(Path(species)), str(species)
+        given, where = _read(Path(species)), species
     try:
-        file = _File.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise SpeciesError(f"{where}: not valid TOML: {error}") from None
+        file = _File.model_validate(given)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise SpeciesError(f"{where}: {key}: {first['msg']} (got {first['input']!r:.60})") from None
-    return _assemble(file, where)
+        first = error.errors(include_url=False)[0]
+        key = shortened(".".join(str(part) for part in first["loc"]))
+        raise SpeciesError(f"{where}: {key}: {first['msg']} (got {shortened(repr(first['input']))})") from None
+    except OverflowError:
+        raise SpeciesError(f"{where}: a number is too large; expected lengths in cm and angles in degrees") from None
+    return _assemble(file, str(where))
 
 
-def _read(path: Path) -> str:
+def _read(path: Path) -> dict[str, Any]:
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise SpeciesError(
-            f"{path}: can't be read as a species file ({reason}); "
-            f"expected a TOML file, or one of the species {', '.join(species_names())}"
-        ) from None
+        return read_toml(path, f"a species file, or one of the species {', '.join(species_names())}")
+    except InputError as error:
+        raise SpeciesError(str(error)) from None
 
 
 def _assemble(file: _File, where: str) -> Species:
@@ -112,7 +111,7 @@ def _assemble(file: _File, where: str) -> Species:
     given = max((known.index(name) for name in file.parameters if name in known), default=0)
     missing = [name for name in known[: max(given, N_PAPER)] if name not in file.parameters]
     if unknown or missing:
-        found = f"unknown {', '.join(unknown)}" if unknown else f"no {', '.join(missing)}"
+        found = f"unknown {shortened(', '.join(unknown))}" if unknown else f"no {', '.join(missing)}"
         raise SpeciesError(f"{where}: parameters: {found}; the {file.model} has {', '.join(known)}")
     parameters, ranges = [], []
     for name, unit in zip(known, Phytomer.UNITS, strict=True):
@@ -120,7 +119,7 @@ def _assemble(file: _File, where: str) -> Species:
             continue
         p = file.parameters[name]
         if p.unit != unit:
-            raise SpeciesError(f"{where}: parameters.{name}.unit: expected {unit!r}, got {p.unit!r}")
+            raise SpeciesError(f"{where}: parameters.{name}.unit: expected {unit!r}, got {shortened(repr(p.unit))}")
         lower = -np.inf if p.lower is None else p.lower
         upper = np.inf if p.upper is None else p.upper
         if not lower <= p.range[0] <= p.range[1] <= upper:
@@ -134,4 +133,4 @@ def _assemble(file: _File, where: str) -> Species:
             raise SpeciesError(f"{where}: {error}") from None
         ranges.append(p.range)
     model = Phytomer(**file.constants.model_dump())
-    return Species(file.name, model, ParameterSpace(parameters), np.array(ranges, float))
+    return Species(one_line(file.name), model, ParameterSpace(parameters), np.array(ranges, float))
