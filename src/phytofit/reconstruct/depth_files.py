@@ -52,7 +52,7 @@ def depth_files(folder: Path, pattern: str = "*") -> list[Path]:
         there = [path for path in folder.glob(pattern) if path.is_file() and not path.name.startswith(".")]
     except (NotImplementedError, ValueError, OSError) as error:  # an absolute pattern, or none
         raise SettingError(
-            f"pattern {shortened(repr(pattern))}: expected one such as 'depth_*.png', within the folder ({error})"
+            f"pattern: expected one such as 'depth_*.png', within the folder, got {shortened(repr(pattern))} ({error})"
         ) from None
     files = [path for path in there if path.suffix.lower() in SUFFIXES]
     if not files:
@@ -103,7 +103,7 @@ def read_views(
         If a file can't be read, is no depth image, has another size, or its depths are not those of a plant.
     """
     if unit is not None and unit not in UNITS:
-        raise SettingError(f"unit of depths: expected mm, cm or m, got {shortened(repr(unit))}")
+        raise SettingError(f"unit: expected mm, cm or m, got {shortened(repr(unit))}")
     step_cm = camera.step_cm if unit is None else SCALE_CM[unit]
     stored = [_stored(path, camera) for path in files]
     depths, n_full = [], 0
