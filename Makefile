@@ -4,7 +4,7 @@ BIN := .venv/bin
 EACH_CORE := --numprocesses auto --dist loadfile
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: install demo test test-long check bench bench-accuracy bench-segment paper docs
+.PHONY: install demo test test-long check bench bench-accuracy bench-segment paper pictures docs
 
 install: .venv/installed
 
@@ -53,6 +53,10 @@ bench-segment: install
 	$(BIN)/python benchmarks/segment.py --each
 	$(BIN)/python benchmarks/plants.py
 	$(BIN)/python benchmarks/neighbours.py
+
+# The pictures of results of real clouds in the README and the documentation; they need ../shared/data.
+pictures: install
+	$(BIN)/python docs/pictures.py
 
 docs: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'

@@ -15,10 +15,12 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import to_rgb
 
 import phytofit
-from phytofit.plots import plot_plant
+from phytofit.plots import plot_plant, plot_plants
 from phytofit.plots.page import digits, fitting, folded, in_short, interval, number, width_in
 from phytofit.plots.phytomer import MEASURE
 from phytofit.plots.plant import LEAF_COLORS
+from phytofit.plots.views import widest_side
+from phytofit.reconstruct.placing import Rejected
 from phytofit.results import trait_table
 from phytofit.segmentation import SegmentedLeaf
 from phytofit.traits import Trait
@@ -187,6 +189,37 @@ def test_a_plant_of_any_shape_has_its_pictures(seed, n_leaves, n_points, size, u
         assert sum(map(len, dots)) == 2 * (len(plant.cloud) - 1)  # all but the stray point far away
 
 
+@pytest.mark.parametrize(("n_points", "n_views"), [(1, 1), (500, 60)])
+def test_a_reconstruction_has_its_picture(n_points, n_views):
+    random = np.random.default_rng(0)
+    result = phytofit.Reconstruction(
+        cloud=phytofit.PointCloud(random.normal(0.0, [20.0, 5.0, 30.0], (n_points, 3)), name="plant"),
+        view=random.integers(0, n_views, n_points),
+        n_views=np.ones(n_points, np.int64),
+        camera=phytofit.load_camera("kinect-v2"),
+        files=tuple(f"scan/{HOSTILE}_{i}.png" for i in range(n_views)),
+        poses=np.tile(np.eye(4), (n_views, 1, 1)),
+        pairs=(),
+        turn=None,
+        step_deg=-32.5,
+        loop=(4.0, 0.25),
+        contradicted=0.0,
+        rejected=(Rejected(HOSTILE, "it does not fit the others"),) * 20,
+        flags=(HOSTILE,),
+        settings={},
+    )
+    figure = phytofit.plot_reconstruction(result, HOSTILE)
+    rendered(figure)
+    assert any("left out: " in word for word in words_of(figure))
+    assert {len(ax.collections[0].get_offsets()) for ax in figure.axes} == {n_points}
+
+
+def test_a_cloud_of_many_points_has_its_picture_without_much_memory():
+    """The widest side of 200,000 points: one number for each pair of them would be 300 GB."""
+    points = np.random.default_rng(0).normal(0.0, [3.0, 1.0, 9.0], (200_000, 3))
+    assert abs(widest_side(points, np.array([0.0, 0.0, 1.0]))[0]) > 0.99
+
+
 def test_a_plant_s_table_says_what_was_measured_and_what_is_wrong():
     plant = plant_of(0, 2, 9)
     words = words_of(plot_plant(plant, traits_of(plant)))
@@ -211,6 +244,9 @@ def test_each_of_several_plants_has_its_views_and_table():
     figure = plot_plant(plants, table, "pot")
     rendered(figure)
     assert {"pot, plant 1", "pot, plant 2"} <= set(words_of(figure))
+    together = plot_plants(plants, HOSTILE)
+    rendered(together)
+    assert all({"1", "2"} <= {text.get_text() for text in ax.texts} for ax in together.axes)
 
 
 def test_neighbouring_leaves_differ_in_grey():
