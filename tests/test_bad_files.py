@@ -139,6 +139,9 @@ ERRORS = [
     ("a.txt", XYZ_TEXT + "1 2 leaf\n", "a.txt: line 121 holds 'leaf' in column '3', expected a number"),
     ("a.csv", "x;y;z\n1;2;3\n1_000;2;3\n", "a.csv: line 3 holds '1_000' in column 'x', expected a number"),
     ("a.csv", "x;y;z\n1,5;2;3\n1.000,5;2;3\n", "a.csv: line 3 holds '1.000.5' in column 'x', expected a number"),
+    ("a.pts", f"121\n{XYZ_TEXT}", "a.pts: truncated: it declares 121 points and holds 120; copy it again, or correct"),
+    ("a.txt", f"//X Y Z\n130\n{XYZ_TEXT}", "a.txt: truncated: it declares 130 points and holds 120; copy it"),
+    ("a.pts", f"{XYZ_TEXT}99\n1 2 3\n", "a.pts: truncated: it declares 99 points and holds 1; copy it again"),
     ("a.txt", "1 " * 2000, "a.txt: expected columns x y z and a few more, found 2000; is it a table of points?"),
     ("a.csv", "x,y,z," + "n" * 999 + "\n1,2,3,4,5\n", "a.csv: found 4 column names over 5 columns; name each column"),
     # clouds
@@ -224,6 +227,7 @@ BELIEVED = [
     ("a.las", patched(LAS, "<I", 107, 2**32 - 1)),
     ("a.las", patched(LAS, "<I", 100, 2**32 - 1)),
     ("a.las", patched(las(POINTS / 100, 6, "1.4"), "<I", 243, 2**32 - 1)),
+    ("a.pts", f"{10**17}\n{XYZ_TEXT}"),
     ("a.laz", patched(LAZ, "<Q", 247, 2**60)),
     ("a.laz", patched(LAZ, "<I", LAZ_TABLE + 4, 2**32 - 1)),
     *(("a.laz", patched(LAZ, "<I", LAZ_START + 8 + 36 + 4 + 4 * layer, 2**32 - 1)) for layer in range(12)),

@@ -290,8 +290,9 @@ def test_coordinates_with_few_digits_keep_their_copies_and_lose_their_steps(
     assert len(cloud) == 3000
     np.testing.assert_allclose(cloud.step, step, rtol=1e-5)
     spread = cloud.unrounded()
-    assert np.abs(spread.points - cloud.points).max() <= step / 2
-    assert np.std(spread.points - points, axis=0) == pytest.approx(step / np.sqrt(6), rel=0.05)  # of two roundings
+    assert np.abs(spread.points - cloud.points).max() <= step / 4
+    assert len(np.unique(spread.points, axis=0)) == 3000
+    assert np.std(spread.points - points, axis=0) == pytest.approx(step * np.sqrt(1.25 / 12), rel=0.05)
     order = np.random.default_rng(0).permutation(3000)
     again = cloud.take(order).unrounded().points
     assert {*map(tuple, again.tolist())} == {*map(tuple, spread.points.tolist())}

@@ -1,7 +1,6 @@
 """Files written by other libraries, or composed byte by byte, against what is read of them; and no surprise ends."""
 
 import io
-import re
 import struct
 import sys
 from pathlib import Path
@@ -88,11 +87,11 @@ def test_files_that_several_scans_were_joined_in_say_so(tmp_path: Path) -> None:
         assert "scans, read as one cloud" in read_cloud(path, "cm").notes[0]
 
 
-@pytest.mark.parametrize("head", ["121\n", "//X Y Z\n130\n", "2\n121\n"])
-def test_a_wrong_count_is_said(tmp_path: Path, head: str) -> None:
-    cloud = read_cloud(put(tmp_path / "a.pts", text(POINTS, head=head)), "cm")
-    np.testing.assert_array_equal(cloud.points, POINTS)
-    assert re.fullmatch(r"the file declares (121|130|2) points and holds 120: is it whole\?", cloud.notes[0])
+def test_a_count_that_is_too_small_is_said(tmp_path: Path) -> None:
+    for head in ("119\n", "//X Y Z\n119\n"):
+        cloud = read_cloud(put(tmp_path / "a.pts", text(POINTS, head=head)), "cm")
+        np.testing.assert_array_equal(cloud.points, POINTS)
+        assert cloud.notes == ("the file declares 119 points and holds 120: which is right?",)
 
 
 # labels

@@ -77,10 +77,7 @@ class PointCloud:
         return shifted
 
     def unrounded(self) -> "PointCloud":
-        """Return the cloud with each point anywhere within the step by which its coordinates were rounded.
-
-        It is the same cloud where they have enough digits.
-        """
+        """Return the cloud with its points off the coarse grid on which few digits put them, if they did."""
         return replace(self, points=unrounded(self.points, self.step)) if self.step.any() else self
 
     def with_note(self, text: str) -> "PointCloud":

@@ -187,10 +187,12 @@ def _without_counts(body: str, counts: Sequence[int]) -> tuple[bool, str, tuple[
     n_scans = sum(n > 0 for n in found)
     declared = [(count, found[0]) for count in counts]
     declared += [(int(mark[1]), n) for mark, n in zip(marks, found[1:], strict=True)]
-    wrong = next((pair for pair in declared if pair[0] not in (pair[1], sum(found), n_scans)), None)
     notes: tuple[str, ...] = (f"{n_scans} scans, read as one cloud",) if n_scans > 1 else ()
-    if wrong is not None:
-        notes += (f"the file declares {wrong[0]} points and holds {wrong[1]}: is it whole?",)
+    for count, n in declared:
+        if n < count not in (sum(found), n_scans):
+            raise FileError(f"truncated: it declares {count} points and holds {n}; copy it again, or correct the count")
+        if n > count not in (sum(found), n_scans):
+            notes += (f"the file declares {count} points and holds {n}: which is right?",)
     return True, COUNT.sub("", body), notes
 
 

@@ -48,13 +48,13 @@ def places_of(points: FloatArray) -> Places:
 
 
 def unrounded(points: FloatArray, step: FloatArray) -> FloatArray:
-    """The points (n, 3), each anywhere in the cell of `step` (3,) that rounding put into its middle.
+    """The points (n, 3), each moved by up to a quarter of `step` (3,), so that they no longer lie on a grid.
 
-    Always drawn alike, whatever the order of the points.
+    That adds a quarter of the variance which rounding added.  Always drawn alike, whatever the order of the points.
     """
     order = np.lexsort(points.T)
     moved = points.copy()
-    moved[order] += step * np.random.default_rng(0).uniform(-0.5, 0.5, points.shape)
+    moved[order] += step * np.random.default_rng(0).uniform(-0.25, 0.25, points.shape)
     return moved
 
 
