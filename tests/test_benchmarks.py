@@ -54,6 +54,7 @@ def clouds():
     return patch[:400] @ turn.T + [0.3, -0.2, 0.4], patch[400:]
 
 
+@pytest.mark.long
 def test_speed_benchmark_runs():
     said = run("speed.py", "--quick")
     for title in ("Table I:", "Equal work:", "A whole search:", "Floor:", "Agreement:"):
@@ -140,7 +141,7 @@ def test_a_circle_is_measured_past_a_stub():
 def test_a_tape_follows_an_arc_from_the_stem(gap):
     """A blade 4 cm wide and 40 cm long, bent to a circle of 20 cm, on a stem of 3 cm; 4 cm of it may be missing."""
     tool, random = load("tape_measure"), np.random.default_rng(1)
-    s, v = random.uniform(0.0, 40.0, 3000), random.uniform(-2.0, 2.0, 3000)
+    s, v = random.uniform(0.0, 40.0, 1500), random.uniform(-2.0, 2.0, 1500)
     if gap:
         s, v = s[(s < 20.0) | (s > 24.0)], v[(s < 20.0) | (s > 24.0)]
     bent = s / 20.0 + np.deg2rad(40.0)
@@ -245,6 +246,7 @@ def test_a_leaf_is_cut_with_its_piece_of_stem_and_scaled():
     assert cut_leaves.cut_leaf(plant, 4, 1000) is None
 
 
+@pytest.mark.long
 def test_evidence_tells_a_parameter_that_is_there_from_one_that_is_not(monkeypatch):
     """Leaves that bend sideways, each by another angle, and have no wave: the one pays for itself on plants that were
     left out, the other costs."""
