@@ -95,6 +95,18 @@ def test_a_cloud_that_can_not_be_fitted_is_counted_and_named():
     assert table["within"].tolist() == [0.0] * len(MAIN_TRAITS)
 
 
+def test_without_a_terminal_each_sensor_has_a_line(tmp_path, monkeypatch):
+    found = phytofit.measure(phytofit.simulate(seed=0, n_points=100).organs)
+    monkeypatch.setattr(trials, "fit", lambda *_, **__: SimpleNamespace(traits=found))
+    monkeypatch.setattr(trials, "N_POINTS", (300, 500))
+    monkeypatch.setattr(trials, "N_VIEWS", (1,))
+    arguments = ["validate", "--simulate", "-n", "3", "--points", "300", "--out", str(tmp_path / "v")]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    lines = [line for line in done.stderr.splitlines() if "sensor" in line]
+    assert lines == [f"simulated phytomers: sensor {i} of 3" for i in (1, 2, 3)]
+
+
 @pytest.mark.long
 def test_the_command_answers(tmp_path):
     arguments = ["validate", "--simulate", "-n", "3", "--points", "600", "--noise", "0.2", "--views", "2"]

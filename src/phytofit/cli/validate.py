@@ -9,7 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from phytofit.cli.console import command, err, out, remark, results_in, say, show
+from phytofit.cli.console import command, err, out, progress_line, remark, results_in, say, show
 from phytofit.cli.options import (
     MOST_POINTS,
     NoiseOption,
@@ -40,23 +40,10 @@ __all__ = ["validate_command"]
 
 SHOWN = ("n", "bias", "RMSE", "R", "CCC", "covered")  # of an agreement, on the screen
 SIMULATE = defaults_of("simulation", "simulate")
-OF_SIMULATION = (  # options that describe a sensor, and what is simulated
-    [
-        "points",
-        "noise",
-        "noise_reach",
-        "views",
-        "spheres",
-        "sphere_diameter",
-        "outliers",
-        "number",
-        "within",
-        "within_deg",
-        "species",
-        "seed",
-        "threads",
-    ]
-)
+OF_SIMULATION = [  # options that describe a sensor, and what is simulated
+    *("points", "noise", "noise_reach", "views", "spheres", "sphere_diameter", "outliers"),
+    *("number", "within", "within_deg", "species", "seed", "threads"),
+]
 SPECIES = defaults_of("species", "load_species")["species"]
 
 
@@ -68,7 +55,9 @@ def validate_command(
     ] = None,
     truth: Annotated[
         Path | None,
-        typer.Option(help="CSV of hand measures: a row a cloud, columns such as leaf_length_cm, 'Leaf angle (deg)'."),
+        typer.Option(
+            help="Hand measures, CSV or .xlsx: a row for each cloud, columns like leaf_length_cm, 'Leaf angle (deg)'."
+        ),
     ] = None,
     simulated: Annotated[
         bool, typer.Option("--simulate", help="No results: simulated phytomers, seen by a sensor such as yours.")
@@ -143,14 +132,16 @@ def validate_command(
 
 def _against_the_hand(results: Path, truth: Path, folder: Path) -> None:
     from phytofit.report import agreement_page
-    from phytofit.validation import agreement, compare, read_measures, read_results
+    from phytofit.validation import agreement, compare, listed, read_measures, read_results
 
     measures = read_measures(truth)
-    comparison = compare(measures, read_results(results))
+    given = read_results(results)
+    comparison = compare(measures, given)
     found = agreement(comparison.pairs)
     if not found:
         raise InputError(
-            f"{truth}: none of its clouds and traits is among those of {results}; are the clouds' names the same?"
+            f"{truth}: none of its clouds and traits has a result in {results}; expected names such as "
+            f"{listed(given['cloud'].unique().tolist())}, found {listed(measures['cloud'].unique().tolist())}"
         )
     with results_in(folder):
         for text in (*comparison.notes, *comparison.unmatched):
@@ -182,6 +173,8 @@ def _tried(
         task = bar.add_task("simulated phytomers", total=runs * number)
 
         def done() -> None:
+            if bar.tasks[0].completed % number == 0:
+                progress_line(f"simulated phytomers: sensor {round(bar.tasks[0].completed / number) + 1} of {runs}")
             bar.advance(task)
 
         base = trial(sensor, species, number=number, seed=seed, threads=threads, progress=done)
@@ -258,4 +251,4 @@ def _show(found: "Sequence[Agreement]", title: str) -> None:
     for name, row in zip(shown.index, shown[list(SHOWN)].to_numpy(), strict=True):
         table.add_row(str(name), *row)
     show(table)
-    say(f"{max(a.flagged for a in found)} of {max(a.n for a in found)} results flagged")
+    say(f"{sum(a.flagged for a in found)} of {sum(a.n for a in found)} values are flagged")

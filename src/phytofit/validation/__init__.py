@@ -3,6 +3,7 @@
 from phytofit.validation.agreement import Agreement, agreement, concordance
 from phytofit.validation.matching import PAIR_COLUMNS, Comparison, compare
 from phytofit.validation.measures import read_measures, read_results
+from phytofit.validation.tables import listed
 
 __all__ = [
     "PAIR_COLUMNS",
@@ -11,6 +12,7 @@ __all__ = [
     "agreement",
     "compare",
     "concordance",
+    "listed",
     "read_measures",
     "read_results",
 ]

@@ -46,27 +46,23 @@ def trial(
     """Draw `number` phytomers from the species' ranges, scan them with the `sensor` (settings of
     :func:`phytofit.simulate`), and fit each.  The same `seed` draws the same phytomers for every sensor.
 
-    progress : called after each phytomer
+    progress : called before each phytomer
     """
     species = load_species() if species is None else species
     pairs, refused = [], []
     for i in range(number):
         name = f"phytomer_{i + 1:04d}"
-        try:
-            made = simulate(species, seed=seed + i, **sensor)
-        except SettingError as error:  # its spheres may remove all points of one phytomer, and leave the next
-            refused.append(f"{name}: {error}")
-            continue
-        try:
-            result = fit(made.points, "cm", species=species, threads=threads)
-        except (CloudError, NoPhytomerError) as error:
-            refused.append(f"{name}: {error}")
-        else:
-            for truth, found in zip(measure(made.organs), result.traits, strict=True):
-                flags = "; ".join(found.flags)
-                pairs.append((name, found.name, found.unit, truth.value, found.value, found.low, found.high, flags, 1))
         if progress is not None:
             progress()
+        try:
+            made = simulate(species, seed=seed + i, **sensor)
+            result = fit(made.points, "cm", species=species, threads=threads)
+        except (SettingError, CloudError, NoPhytomerError) as error:  # spheres may remove all points of one phytomer
+            refused.append(f"{name}: {error}")
+            continue
+        for truth, found in zip(measure(made.organs), result.traits, strict=True):
+            flags = "; ".join(found.flags)
+            pairs.append((name, found.name, found.unit, truth.value, found.value, found.low, found.high, flags, 1))
     table = pd.DataFrame(pairs, columns=PAIR_COLUMNS).astype(
         {**dict.fromkeys(PAIR_COLUMNS[3:7], float), "n_measured": int}
     )
