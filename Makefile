@@ -39,6 +39,7 @@ bench-accuracy: install
 	$(BIN)/python benchmarks/evidence.py
 	$(BIN)/python benchmarks/leaf_ends.py
 	$(BIN)/python benchmarks/sections.py --out docs/images
+	$(BIN)/python benchmarks/repeatability.py
 	$(BIN)/python benchmarks/accuracy.py
 
 # The paper's tables and figures; stopped, it goes on where it was. FULL=1: without the limits. Open3D, for one picture and

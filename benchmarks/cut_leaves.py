@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from accuracy import DATA, MM, clouds
+from common import DATA, clouds, read
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
@@ -57,12 +57,10 @@ def leaves(n_points: int, most: int) -> Iterator[Leaf]:
 
 def single_leaves(n_points: int) -> Iterator[Leaf]:
     """The paper's real clouds: not labelled, a leaf on its piece of stem each, y is up."""
-    for path in clouds():
-        if "simulated" not in path.parts:
-            cloud = phytofit.read_cloud(path, "mm" if path.stem in MM else "cm")
-            up = np.array([0.0, 1.0, 0.0])
-            found = phytofit.prepare(cloud, SPECIES, n_points=n_points, up=up, with_outliers=True)
-            yield Leaf(path.parent.name, path.stem, path.stem, found.points, None, found.starts)
+    for path in clouds("greenhouse", "field"):
+        up = np.array([0.0, 1.0, 0.0])
+        found = phytofit.prepare(read(path), SPECIES, n_points=n_points, up=up, with_outliers=True)
+        yield Leaf(path.parent.name, path.stem, path.stem, found.points, None, found.starts)
 
 
 def labelled_plants() -> Iterator[Plant]:

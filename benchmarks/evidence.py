@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thread
 
 import numpy as np
-from accuracy import DATA, progress
+from common import DATA, progress
 from cut_leaves import Leaf, leaves
 from scipy.special import log_ndtr
 

@@ -18,7 +18,7 @@ from unittest import mock
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thread
 
 import numpy as np
-from accuracy import DATA, progress
+from common import DATA, progress
 from cut_leaves import SPECIES, Leaf, leaves
 from scipy.optimize import minimize_scalar
 

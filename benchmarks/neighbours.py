@@ -10,7 +10,7 @@ from itertools import groupby
 
 import numpy as np
 import trimesh
-from accuracy import DATA
+from common import DATA
 from cut_leaves import labelled_plants
 from scipy.spatial.transform import Rotation
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from accuracy import DATA
+from common import DATA
 from cut_leaves import colored_mesh, labelled_plants
 from reconstruct import DATA as SCAN
 from reconstruct import aligned

@@ -11,7 +11,6 @@ sweeps   simulated phytomers made worse step by step, others at each step: noise
 """
 
 import argparse
-import multiprocessing
 import os
 import sys
 from collections import defaultdict
@@ -24,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thr
 
 import model_free
 import numpy as np
-from accuracy import DATA, progress
+from common import DATA, progress, run_parts
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -377,12 +376,7 @@ def main() -> None:
         "field": field,
         "sweeps": lambda pool: sweeps(pool, arguments.phytomers, arguments.untouched, arguments.peers, arguments.only),
     }
-    unknown = set(arguments.parts) - set(parts)
-    if unknown:
-        sys.exit(f"no part is called {', '.join(unknown)}; there are {', '.join(parts)}")
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
-        for name in arguments.parts or parts:
-            parts[name](pool)
+    run_parts(parts, arguments.parts)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from accuracy import DATA
+from common import DATA
 from cut_leaves import Plant, labelled_plants
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation

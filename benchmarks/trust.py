@@ -13,9 +13,7 @@ maize      leaves of the synthetic maize plants in ../shared/data/openalea_synth
 import argparse
 import csv
 import json
-import multiprocessing
 import os
-import sys
 import time
 from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
@@ -27,7 +25,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thr
 
 import numpy as np
 import trimesh
-from accuracy import DATA, HAND, MM, clouds, progress
+from accuracy import HAND
+from common import DATA, clouds, progress, read, run_parts
 from scipy.spatial import cKDTree
 
 import phytofit
@@ -287,7 +286,7 @@ def interval(trait: phytofit.Trait) -> str:
 
 
 def fit_real(path: Path) -> phytofit.Fit:
-    return phytofit.fit(phytofit.read_cloud(path, "mm" if path.stem in MM else "cm"), threads=1)
+    return phytofit.fit(read(path), threads=1)
 
 
 def seconds(pool: ProcessPoolExecutor, phytomers: int = 15) -> None:
@@ -319,12 +318,7 @@ def main() -> None:
         "maize": maize,
         "seconds": seconds,
     }
-    unknown = set(arguments.parts) - set(parts)
-    if unknown:
-        sys.exit(f"no part is called {', '.join(unknown)}; there are {', '.join(parts)}")
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
-        for name in arguments.parts or parts:
-            parts[name](pool)
+    run_parts(parts, arguments.parts)
 
 
 if __name__ == "__main__":

@@ -69,8 +69,8 @@ def test_speed_benchmark_runs_one_part():
 
 @pytest.mark.long
 def test_accuracy_benchmark_runs():
-    said = run("accuracy.py", "protocol", "--seeds", "1", "--phytomers", "2")
-    assert said.count("leaf_length") == 4  # parameter and trait, with and without stem above
+    said = run("accuracy.py", "protocol", "--seeds", "1", "--phytomers", "2", "--samples", "30")
+    assert said.count("leaf_length") == 2 * 3 * 3  # parameter and trait; the stem above as drawn, and as fitted
 
 
 @pytest.mark.long
@@ -270,6 +270,37 @@ def moved_up(height):
     pose = np.eye(4)
     pose[2, 3] = height
     return pose
+
+
+def test_copies_of_a_cloud_are_the_same_leaf():
+    tool, points = load("repeatability"), np.random.default_rng(0).uniform(-20.0, 20.0, (400, 3))
+    cloud = phytofit.from_points(points, "cm")
+    permuted, subset, moved = (
+        tool.copy_of(cloud, tool.Copy(kind, 3)).points for kind in ("permuted", "subset", "moved")
+    )
+    np.testing.assert_array_equal(permuted[np.lexsort(permuted.T)], points[np.lexsort(points.T)])
+    assert not np.array_equal(permuted, points)
+    assert len(subset) == 360
+    assert {tuple(p) for p in subset} < {tuple(p) for p in points}
+    assert 0.0 < np.abs(moved - points).max() < 1e-8
+
+
+def test_a_trait_comes_back_if_its_spread_is_within_half_its_interval():
+    tool = load("repeatability")
+
+    def measured(length, flagged=False):
+        return tool.Measured({"leaf_length": length}, {"leaf_length": (48.0, 52.0)}, {"leaf_length": flagged})
+
+    def row(*lengths):
+        copies = {tool.Copy("subset", i): measured(length) if length else None for i, length in enumerate(lengths)}
+        return next(tool.rows_of("leaf", measured(50.0), copies))
+
+    near, far, refused = row(51.0, 49.5), row(51.0, 47.5), row(51.0, None)
+    assert (near.half, near.spread["subset"], near.beyond, near.comes_back) == (2.0, 1.0, 0, True)
+    assert (far.spread["subset"], far.beyond, far.comes_back) == (2.5, 1, False)
+    assert not refused.comes_back
+    assert tool.half_interval(50.0, 47.0, None) == 3.0
+    assert tool.half_interval(50.0, None, None) == np.inf
 
 
 @pytest.mark.long
