@@ -37,10 +37,14 @@ LAYERS = [
     {"models"},
     {"cloud"},
     {"kernels"},
-    {"ordering", "parameters", "parsing", "small_files"},
+    {"display", "ordering", "parameters", "parsing", "small_files"},
     {"bundled", "errors", "silence", "text"},
 ]
 DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}
+
+# A result's `plot` and `to_frame` import what stands above it when they are called, and only then.
+RESULTS = ("fitted.py", "segmentation/whole.py", "reconstruct/depth.py")
+SHOWS_ITSELF = {(file, part) for file in RESULTS for part in ("plots", "results")}
 
 FILES = sorted(SOURCE.rglob("*.py"))
 IDS = [str(path.relative_to(SOURCE)) for path in FILES]
@@ -117,9 +121,17 @@ def test_imports_go_one_way():
     for path, name in zip(FILES, IDS, strict=True):
         me = part_of(module_of(path))
         inside = {me} if path.parent != SOURCE else set()
-        upwards = {other for other in own(path) - inside if DEPTH[other] <= DEPTH[me]}
+        above = {other for other in own(path) - inside if DEPTH[other] <= DEPTH[me]}
+        upwards = {other for other in above if (name, other) not in SHOWS_ITSELF}
         wrong += [f"{name} imports {other}, which stands beside or above it" for other in sorted(upwards)]
     assert not wrong
+
+
+def test_results_import_what_shows_them_only_when_it_is_asked_for():
+    for name in RESULTS:
+        tree = ast.parse((SOURCE / name).read_text(encoding="utf-8"))
+        at_once = {node.module for node in tree.body if isinstance(node, ast.ImportFrom)}
+        assert not at_once & {"phytofit.plots", "phytofit.results"}, name
 
 
 def test_the_optimiser_has_never_heard_of_plants():

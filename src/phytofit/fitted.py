@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from phytofit.display import Shown, Summary
 from phytofit.errors import NoPhytomerError, Status
 from phytofit.flags import flags_of
 from phytofit.intervals import Ends, propagated
@@ -16,6 +18,10 @@ from phytofit.outcome import Estimate
 from phytofit.species import Species
 from phytofit.traits import CHORD_CM, Trait, measure
 
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
 __all__ = ["Fit", "beside_its_rival", "remarked"]
 
 FloatArray = NDArray[np.float64]
@@ -25,8 +31,8 @@ OPEN_WITHOUT_TIP = ("leaf_length", "leaf_area")  # no upper end where the tip wa
 TOLD_OF_RIVALS = ("stem_diameter", "leaf_length", "leaf_angle", "leaf_width")
 
 
-@dataclass(frozen=True)
-class Fit:
+@dataclass(frozen=True, repr=False)
+class Fit(Shown):
     """A phytomer model fitted to a cloud.
 
     ``x`` (k,) are the parameters, in the order of ``species.space``; ``pose`` (4, 4) maps the model's frame to the
@@ -38,7 +44,8 @@ class Fit:
     ``reference`` (m, 3) are the points that were fitted, in the cloud's frame, cm.  ``flags`` are remarks on the
     result in plain words, ``notes`` on what was done to the cloud.  ``relative`` says that the cloud had no unit:
     lengths are then relative to each other only, and ``scale`` of them make a cm of the prior (1 otherwise); `x`,
-    `history`, `registration` and `estimate` are in the prior's cm.  ``settings`` repeat the run.
+    `history`, `registration` and `estimate` are in the prior's cm.  ``settings`` repeat the run; ``name`` is the
+    cloud's.
     """
 
     species: Species
@@ -59,6 +66,26 @@ class Fit:
     relative: bool = False
     scale: float = 1.0
     settings: dict[str, object] = field(default_factory=dict)
+    name: str = "cloud"
+
+    def summary(self) -> Summary:
+        """The traits with their intervals, and the flags."""
+        rows = [(t.organ, t.name, f"{t.value:.2f}", t.interval, t.unit) for t in self.traits]
+        title = f"Fit of {self.name}: {self.species.name} phytomer, method {self.method}"
+        columns = ("organ", "trait", "value", "95 % interval", "unit")
+        return Summary(title, columns, rows, [f"flag: {flag}" for flag in self.flags])
+
+    def to_frame(self) -> "pd.DataFrame":
+        """The traits as a table, with the columns of ``traits.csv``."""
+        from phytofit.results import trait_table
+
+        return trait_table(self.name, self.traits)
+
+    def plot(self) -> "Figure":
+        """The model on the points, and the table of traits: ``fit.png``."""
+        from phytofit.plots import plot_fit
+
+        return plot_fit(self, title=self.name)
 
     @property
     def parameters(self) -> dict[str, float]:

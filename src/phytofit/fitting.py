@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from phytofit.cloud import PointCloud, from_points
+from phytofit.cloud import PointCloud, as_cloud
 from phytofit.distances import DISTANCES, Reference
 from phytofit.errors import SettingError, Status
 from phytofit.fitted import Fit, beside_its_rival, remarked
@@ -36,7 +36,7 @@ UP_UNKNOWN = "this leaf does not show which way is up: leaf angle may be 180° m
 
 
 def fit(
-    cloud: PointCloud | ArrayLike,
+    cloud: PointCloud | ArrayLike | str | os.PathLike[str],
     units: str | None = None,
     *,
     species: Species | str | os.PathLike[str] = "sorghum",
@@ -59,8 +59,8 @@ def fit(
 
     Parameters
     ----------
-    cloud : a PointCloud, or points (n, 3) in `units`, n >= 100, in any orientation
-    units : "cm", "mm", "m", or "none" for relative lengths; needed for bare points
+    cloud : a PointCloud; or a file, or points (n, 3), n >= 100, in `units`; in any orientation
+    units : "cm", "mm", "m", or "none" for relative lengths; needed for points, and for files that do not say it
     species : name of a species that comes with phytofit, a TOML file, or a Species
     up : "x", "-x", .. "-z" or a vector, where the upward direction is known
     seed_point : (3,) or (k, 3) in the unit and frame that the cloud was read in, on the leaf that is meant, where the
@@ -95,11 +95,7 @@ def fit(
     direction = parse_up(up)
     seed_points = None if seed_point is None else parse_points(seed_point)
     species = species if isinstance(species, Species) else load_species(os.fspath(species))
-    if not isinstance(cloud, PointCloud):
-        cloud = from_points(cloud, units)
-    elif units not in (None, cloud.unit):
-        raise SettingError(f"units: {cloud.name} was read in {cloud.unit}, got {units!r}; leave units out")
-    cloud = cloud.unrounded()
+    cloud = as_cloud(cloud, units).unrounded()
     search: dict[str, Any] = {"elite_fraction": elite_fraction, "covariance_noise": covariance_noise}
     search["random_start"] = random_start
     given: dict[str, Any] = {"n_samples": n_samples, "n_points": n_points, "n_generations": n_generations}
@@ -130,6 +126,7 @@ def fit(
         notes=(*cloud.notes, *found.notes, *result.notes),
         relative=cloud.unit == "none",
         scale=found.scale,
+        name=cloud.name,
         settings={
             "method": method,
             **used,

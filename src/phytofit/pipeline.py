@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from phytofit.cloud import PointCloud, read_cloud
+from phytofit.display import Shown, Summary
 from phytofit.errors import CloudError, InputError, NoPhytomerError, OutputError, PhytofitError
 from phytofit.fitting import fit
 from phytofit.plots import plot_plant
@@ -38,14 +40,13 @@ from phytofit.results import (
     write_table,
     write_text,
 )
-from phytofit.segmentation import Segmentation, SegmentedLeaf, segment
+from phytofit.segmentation import PLANT_CM, Segmentation, SegmentedLeaf, segment
 from phytofit.species import Species, load_species
 from phytofit.text import one_line
 from phytofit.traits import Trait
 
 __all__ = ["PlantRun", "plant_traits", "run"]
 
-PLANT_CM = (3.0, 500.0)  # sizes that are believed of a whole plant, from the seedling on
 KEY = "stage.json"
 MOST_OUTLIERS = 0.5  # share of a phytomer's points, beyond which what was fitted is not the leaf
 OF_SEGMENTATION = "from the segmentation"
@@ -53,8 +54,8 @@ OF_THE_CUT = ("stem_length",)  # of a phytomer: where it was cut decides them
 Progress = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class PlantRun:
+@dataclass(frozen=True, repr=False)
+class PlantRun(Shown):
     """What became of a plant: ``table`` of its traits (the columns of ``traits.csv``), its ``segmentation``, ``flags``
     in plain words, ``notes`` on what was done to the cloud, and which stages were ``skipped``, being up to date."""
 
@@ -63,6 +64,24 @@ class PlantRun:
     flags: tuple[str, ...]
     notes: tuple[str, ...]
     skipped: tuple[str, ...]
+
+    def summary(self) -> Summary:
+        """The traits of the plant and of its leaves, and the flags."""
+        columns = ["organ", "rank", "trait", "value", "unit"]
+        cells = self.table[columns].to_numpy().tolist()
+        rows = [[organ, str(rank or ""), trait, f"{value:.2f}", unit] for organ, rank, trait, value, unit in cells]
+        title = f"Plant {self.segmentation.cloud.name}: {len(self.segmentation.leaves)} leaves"
+        return Summary(
+            title, ("organ", "leaf", "trait", "value", "unit"), rows, [f"flag: {flag}" for flag in self.flags]
+        )
+
+    def to_frame(self) -> pd.DataFrame:
+        """All traits as a table, with the columns of ``traits.csv``."""
+        return self.table.copy()
+
+    def plot(self) -> Figure:
+        """The plant with its leaves coloured and numbered, beside their traits: ``plant.png``."""
+        return plot_plant(self.segmentation, self.table, title=self.segmentation.cloud.name)
 
 
 def run(

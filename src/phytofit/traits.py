@@ -35,6 +35,12 @@ class Trait:
     method: str = ""
     flags: tuple[str, ...] = ()
 
+    @property
+    def interval(self) -> str:
+        """The ends as they are shown, empty where there is none."""
+        low, high = ("" if end is None else f"{end:.2f}" for end in (self.low, self.high))
+        return f"{low} – {high}" if low or high else ""
+
 
 def measure(
     organs: Sequence[Organ], *, chord_cm: float = CHORD_CM, method: str = "", flags: tuple[str, ...] = ()

@@ -8,7 +8,7 @@ from phytofit.cli.console import command, results_in, say, show
 from phytofit.cli.fit import fit_in_view
 from phytofit.cli.options import OutOption, Seed
 from phytofit.cli.progress import Items
-from phytofit.cli.tables import interval, print_remarks
+from phytofit.cli.tables import print_remarks
 
 __all__ = ["demo_command"]
 
@@ -43,7 +43,7 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
         for column in ("trait", "estimate", "95 % interval", "truth", "unit"):
             table.add_column(column, justify="left" if column in ("trait", "unit") else "right")
         for estimate, truth in zip(result.traits, measure(made.organs), strict=True):
-            numbers = (f"{estimate.value:.2f}", interval(estimate), f"{truth.value:.2f}")
+            numbers = (f"{estimate.value:.2f}", estimate.interval, f"{truth.value:.2f}")
             table.add_row(estimate.name, *numbers, estimate.unit)
         show(table)
         print_remarks(result.notes, result.flags)

@@ -25,7 +25,7 @@ from phytofit.cli.options import (
 )
 from phytofit.cli.progress import Told
 from phytofit.cli.settings import defaults_of, entries_of
-from phytofit.cli.tables import interval, print_remarks, print_skipped
+from phytofit.cli.tables import print_remarks, print_skipped
 from phytofit.errors import SettingError
 from phytofit.text import for_terminal
 
@@ -211,7 +211,7 @@ def _print_fit(result: "Fit", name: str, where: Path) -> None:
     for column in ("organ", "trait", "value", "95 % interval", "unit"):
         table.add_column(column, justify="right" if column in ("value", "95 % interval") else "left")
     for trait in result.traits:
-        table.add_row(trait.organ, trait.name, f"{trait.value:.2f}", interval(trait), trait.unit)
+        table.add_row(trait.organ, trait.name, f"{trait.value:.2f}", trait.interval, trait.unit)
     show(table)
     print_remarks(result.notes, result.flags)
     unit = "relative" if result.relative else "cm"

@@ -50,9 +50,8 @@ def segment_command(
 
         phytofit segment corrected.ply --units mm --labels label
     """
-    from phytofit.pipeline import PLANT_CM
     from phytofit.results import leaf_tables, save_plants
-    from phytofit.segmentation import segment, separate_plants
+    from phytofit.segmentation import PLANT_CM, segment, separate_plants
 
     files, skipped = cloud_files(clouds)
 

@@ -3,22 +3,13 @@
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from phytofit.cli.console import remark
 
-if TYPE_CHECKING:
-    from phytofit.traits import Trait
-
-__all__ = ["interval", "print_remarks", "print_skipped"]
+__all__ = ["print_remarks", "print_skipped"]
 
 NAMED = 3  # so many of the files that were skipped are named
 OF_LEAF = re.compile(r"leaf (\d+): (.*)", re.DOTALL)
-
-
-def interval(trait: "Trait") -> str:
-    low, high = ("" if end is None else f"{end:.2f}" for end in (trait.low, trait.high))
-    return f"{low} – {high}" if low or high else ""
 
 
 def print_remarks(notes: Iterable[str], flags: Iterable[str]) -> None:

@@ -8,18 +8,20 @@ the first of its files is read.
 import os
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from phytofit.cloud.cloud import PointCloud, from_points
 from phytofit.cloud.encoding import content_fault, in_utf8
 from phytofit.cloud.faces import sampled
 from phytofit.cloud.table import COLOR, NORMAL, XYZ, Columns, FileError, Table, key_of, listed
-from phytofit.errors import CloudError
+from phytofit.errors import CloudError, SettingError
 from phytofit.silence import silenced
 from phytofit.text import one_line
 
-__all__ = ["READERS", "read_cloud"]
+__all__ = ["READERS", "as_cloud", "read_cloud"]
 
 READERS = {
     **{".ply": "ply", ".pcd": "pcd", ".las": "las", ".laz": "las", ".e57": "e57", ".obj": "obj"},
@@ -98,6 +100,24 @@ def read_cloud(
     if n_faces and sample_faces is None:
         cloud = cloud.with_note(f"a mesh of {n_faces} faces: its vertices are the points")
     return cloud if table.unit in (None, cloud.unit) else cloud.with_note(OTHER_UNIT.format(table.unit, cloud.unit))
+
+
+def as_cloud(
+    given: PointCloud | ArrayLike | str | os.PathLike[str],
+    units: str | None = None,
+    **how: Any,
+) -> PointCloud:
+    """A cloud as it is, or read from a file, or made of points (n, 3) in `units`; `how` as for :func:`read_cloud`.
+
+    Raises SettingError where a cloud was read in another unit.
+    """
+    if isinstance(given, (str, os.PathLike)):
+        return read_cloud(Path(given), units, **how)
+    if not isinstance(given, PointCloud):
+        return from_points(given, units, **how)
+    if units not in (None, given.unit):
+        raise SettingError(f"units: {given.name} was read in {given.unit}, got {units!r}; leave units out")
+    return given
 
 
 def _table(data: bytes, suffix: str, label_property: str | None) -> Table:

@@ -3,13 +3,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from phytofit.cloud import MIN_POINTS, SCALE_CM, PointCloud
+from phytofit.display import Shown, Summary
 from phytofit.errors import InputError, SettingError
 from phytofit.reconstruct.cameras import Camera, load_camera
 from phytofit.reconstruct.depth_files import DepthView, depth_files, read_views
@@ -20,6 +21,10 @@ from phytofit.reconstruct.turntable import Turn
 from phytofit.reconstruct.views import drop_flying_pixels, surface_normals, view_points
 from phytofit.small_files import read_json, shortened
 
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
 __all__ = ["Reconstruction", "read_poses", "reconstruct"]
 
 FloatArray = NDArray[np.float64]
@@ -28,8 +33,8 @@ LEAST_RETURNS = 0.01  # share of an image's pixels; below, the image is empty
 DOUBTFUL, REFUSED = 0.15, 0.4  # shares of points that other views see through; right poses leave some per cent
 
 
-@dataclass(frozen=True, eq=False)
-class Reconstruction:
+@dataclass(frozen=True, eq=False, repr=False)
+class Reconstruction(Shown):
     """A plant's cloud from several depth images, and how far to trust it.
 
     ``cloud`` in cm, z up, with normals; on a turntable z is its axis, x points to the first view's camera, and z = 0
@@ -55,6 +60,29 @@ class Reconstruction:
     rejected: tuple[Rejected, ...]
     flags: tuple[str, ...]
     settings: dict[str, Any]
+
+    def summary(self) -> Summary:
+        """The views, and the flags."""
+        rows = [(file, "" if np.isnan(angle) else f"{angle:.1f}") for file, angle in self._angles()]
+        remarks = [f"left out: {view.file}: {view.reason}" for view in self.rejected]
+        title = f"Reconstruction of {self.cloud.name}: {len(self.cloud)} points of {len(self.files)} views"
+        return Summary(title, ("view", "angle, deg"), rows, [*remarks, *(f"flag: {flag}" for flag in self.flags)])
+
+    def to_frame(self) -> "pd.DataFrame":
+        """The views as a table: ``file``, and ``angle_deg`` by which the plant had turned, where it turned."""
+        import pandas as pd
+
+        return pd.DataFrame(self._angles(), columns=["file", "angle_deg"])
+
+    def _angles(self) -> list[tuple[str, float]]:
+        turned = np.full(len(self.files), np.nan) if self.turn is None else np.degrees(self.turn.angles)
+        return list(zip(self.files, turned.tolist(), strict=True))
+
+    def plot(self) -> "Figure":
+        """The cloud from three sides, coloured by view: ``reconstruction.png``."""
+        from phytofit.plots import plot_reconstruction
+
+        return plot_reconstruction(self, title=self.cloud.name)
 
     @property
     def residual_cm(self) -> float:

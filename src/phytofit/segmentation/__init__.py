@@ -2,6 +2,6 @@
 
 from phytofit.segmentation.derive import SegmentedLeaf
 from phytofit.segmentation.plants import separate_plants
-from phytofit.segmentation.whole import Segmentation, segment
+from phytofit.segmentation.whole import PLANT_CM, Segmentation, segment
 
-__all__ = ["Segmentation", "SegmentedLeaf", "segment", "separate_plants"]
+__all__ = ["PLANT_CM", "Segmentation", "SegmentedLeaf", "segment", "separate_plants"]

@@ -4,6 +4,7 @@ A piece of a plant is not another plant: a leaf beyond a gap has no round stem, 
 a plant stands above the rest of its stem.  Where plants touch, the nearer stem over the surface decides.
 """
 
+import os
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,13 +13,14 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from phytofit.cloud import PointCloud
+from phytofit.cloud import PointCloud, as_cloud
 from phytofit.errors import NoStemError
 from phytofit.parsing import parse_up
 from phytofit.segmentation.graph import PlantGraph, coarse, plant_graph
 from phytofit.segmentation.ground import find_grounds
 from phytofit.segmentation.organs import FLAT, along_path
 from phytofit.segmentation.root import Standing, ends_of, stands_on
+from phytofit.segmentation.whole import PLANT_CM
 
 __all__ = ["separate_plants"]
 
@@ -45,7 +47,12 @@ class _Plant:
     standing: Standing
 
 
-def separate_plants(cloud: PointCloud, *, up: str | ArrayLike | None = None) -> tuple[PointCloud, ...]:
+def separate_plants(
+    cloud: PointCloud | ArrayLike | str | os.PathLike[str],
+    units: str | None = None,
+    *,
+    up: str | ArrayLike | None = None,
+) -> tuple[PointCloud, ...]:
     """The plants of a cloud, each as a cloud of its own; the cloud itself where it holds one.
 
     A plant has a stem on which it stands, from which at least two ends part.  Plants are numbered along the axis of the
@@ -54,10 +61,13 @@ def separate_plants(cloud: PointCloud, *, up: str | ArrayLike | None = None) -> 
     Parameters
     ----------
     cloud
-        Plants in any orientation, all growing the same way.
+        Plants in any orientation, all growing the same way; or a file or points (n, 3) of them in `units`.
+    units
+        As for :func:`segment`.
     up
         The upward direction where it is known, as for :func:`segment`.
     """
+    cloud = as_cloud(cloud, units, plausible_cm=PLANT_CM)
     first, stands_for = coarse(cloud.points)
     points = cloud.points[first]
     ground, direction = find_grounds(points, parse_up(up))

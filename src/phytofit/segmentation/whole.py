@@ -1,13 +1,15 @@
 """A plant's cloud taken apart: the one function that calls all the others, and what it returns."""
 
+import os
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from phytofit.cloud import PointCloud
+from phytofit.cloud import PointCloud, as_cloud
+from phytofit.display import Shown, Summary
 from phytofit.errors import CloudError, NoStemError, SettingError
 from phytofit.ordering import canonical_order
 from phytofit.parsing import parse_up
@@ -19,8 +21,13 @@ from phytofit.segmentation.labelled import labelled_organs, leaf_names
 from phytofit.segmentation.organs import Organs, along_path, find_organs
 from phytofit.segmentation.root import find_root
 
-__all__ = ["Segmentation", "segment"]
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
 
+__all__ = ["PLANT_CM", "Segmentation", "segment"]
+
+PLANT_CM = (3.0, 500.0)  # sizes that are believed of a whole plant, from the seedling on
 FloatArray = NDArray[np.float64]
 MIN_POINTS = 100  # of a cloud that can be told apart
 LEAST_SETTING = 500  # nodes
@@ -32,8 +39,8 @@ HUGS = 10.0  # stem radii, at least, of stem below; so far a leaf may lie agains
 BESIDE = 0.5  # cosine of the angle about the stem's axis within which a point is on a leaf's side
 
 
-@dataclass(frozen=True)
-class Segmentation:
+@dataclass(frozen=True, repr=False)
+class Segmentation(Shown):
     """A plant's points by organ, and what follows.
 
     ``cloud`` is what was segmented, ``labels`` (n,) of its points: 0 unknown, ground or pot, 1 stem, 2.. leaves
@@ -50,6 +57,35 @@ class Segmentation:
     leaves: tuple[SegmentedLeaf, ...]
     notes: tuple[str, ...] = ()
     settings: dict[str, Any] = field(default_factory=dict)
+
+    def summary(self) -> Summary:
+        """The leaves from the base, and their flags."""
+        unit = "rel" if self.cloud.unit == "none" else "cm"
+        columns = ("leaf", f"collar along the stem, {unit}", f"length, {unit}", "azimuth, deg", "points")
+        rows = [
+            (
+                str(leaf.rank),
+                f"{leaf.collar_distance:.1f}",
+                f"{leaf.length:.1f}",
+                f"{leaf.azimuth:.0f}",
+                str(leaf.n_points),
+            )
+            for leaf in self.leaves
+        ]
+        flags = [f"flag: leaf {leaf.rank}: {flag}" for leaf in self.leaves for flag in leaf.flags]
+        return Summary(f"Segmentation of {self.cloud.name}: {len(self.leaves)} leaves", columns, rows, flags)
+
+    def to_frame(self) -> "pd.DataFrame":
+        """The leaves as a table, with the columns of ``leaves.csv``."""
+        from phytofit.results import leaf_table
+
+        return leaf_table(self.cloud.name, self)
+
+    def plot(self) -> "Figure":
+        """The plant with its leaves coloured and numbered: ``segmentation.png``."""
+        from phytofit.plots import plot_segmentation
+
+        return plot_segmentation(self, title=self.cloud.name)
 
     @property
     def plant(self) -> PointCloud:
@@ -90,7 +126,8 @@ class Segmentation:
 
 
 def segment(
-    cloud: PointCloud,
+    cloud: PointCloud | ArrayLike | str | os.PathLike[str],
+    units: str | None = None,
     *,
     up: str | ArrayLike | None = None,
     n_nodes: int = 8000,
@@ -104,7 +141,10 @@ def segment(
     Parameters
     ----------
     cloud
-        One plant with stem and leaves, in any orientation; ground and pot may be below it.
+        One plant with stem and leaves, in any orientation; ground and pot may be below it.  A PointCloud, or a file or
+        points (n, 3) in `units`.
+    units
+        "cm", "mm", "m", or "none" for relative lengths; needed for files without a unit and for points.
     up
         The upward direction where it is known, as for :func:`phytofit.fit`; else it is told by the plant: the stem's
         base is the end that is round, and from which the leaves part forwards and droop.
@@ -124,6 +164,7 @@ def segment(
         If `up` or `n_nodes` can't be used.
     """
     direction = parse_up(up)
+    cloud = as_cloud(cloud, units, plausible_cm=PLANT_CM)
     if n_nodes < LEAST_SETTING:
         raise SettingError(f"segment: expected n_nodes >= {LEAST_SETTING}, got {n_nodes}")
     if len(cloud) < MIN_POINTS:
