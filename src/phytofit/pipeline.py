@@ -119,7 +119,7 @@ def run(
     """
     source, folder = Path(source), Path(folder)
     if source.is_dir() and source.resolve() == folder.resolve():
-        raise InputError(f"{folder}: the folder of the images can't hold the results; name another with --out")
+        raise InputError(f"{folder}: the folder of the images can't hold the results; choose another folder")
     name = source.resolve().stem if source.is_file() else source.resolve().name
     _prepare(folder)
     species = species if isinstance(species, Species) else load_species(species)
@@ -127,11 +127,11 @@ def run(
     cloud_file = source
     if source.is_dir():
         if camera is None:
-            raise InputError(f"{source}: a folder of depth images needs --camera: a preset, or a TOML file")
+            raise InputError(f"{source}: a folder of depth images needs its camera: a preset, or a TOML file")
         how = {"camera": camera, "step_deg": step_deg, "unit": unit, "poses": poses, "pattern": pattern}
         cloud_file, units, up = _reconstructed(source, folder, how, log), "cm", up or "z"
     elif camera is not None:
-        raise InputError(f"{source}: --camera is for a folder of depth images, and this is none")
+        raise InputError(f"{source}: a camera is for a folder of depth images, and this is none")
     found = _segmented(cloud_file, folder, {"name": name, "units": units, "up": up, "labels": labels}, log)
     tables = [trait_table(name, plant_traits(found))]
     for i, (leaf, phytomer) in enumerate(zip(found.leaves, found.phytomers(), strict=True)):
@@ -201,8 +201,8 @@ def _segmented(cloud_file: Path, folder: Path, how: Mapping[str, Any], log: _Log
     key = _key("segment", [cloud_file], how)
     if _same_but_edited(target, key, "plant.ply"):
         raise InputError(
-            f"{target / 'plant.ply'}: it was changed since it was written; to use its labels run on that file with "
-            f"--labels label and another --out, or delete {target} to begin anew"
+            f"{target / 'plant.ply'}: it was changed since it was written; to use its labels, measure that file and "
+            f"name the property that holds them, label, and choose another folder; or delete {target} to begin anew"
         )
     if _up_to_date(target, key):
         found = read_segmentation(target)

@@ -228,12 +228,12 @@ def unforeseen(error: Exception) -> str:
 
 def complain(error: Exception | str) -> None:
     """An error, in one line."""
-    _line(err, "error: ", "bold red", error if isinstance(error, str) else at_command_line(error), logging.ERROR)
+    _line(err, "error: ", "bold red", at_command_line(error), logging.ERROR)
 
 
 def remark(kind: str, text: str) -> None:
     """A note, which informs, or a flag, which says what to doubt."""
-    _line(out, f"{kind}: ", "" if kind == "note" else "bold yellow", text, logging.INFO)
+    _line(out, f"{kind}: ", "" if kind == "note" else "bold yellow", at_command_line(text), logging.INFO)
 
 
 def say(text: str) -> None:

@@ -1,6 +1,7 @@
 """What a user gives to be measured: files, folders, globs; and what is no cloud, with the command that takes it."""
 
 import glob
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -33,14 +34,14 @@ def cloud_files(given: Sequence[str]) -> tuple[list[Path], list[Path]]:
     skipped: list[Path] = []
     for text in given:
         path = Path(text)
-        if path.is_dir():
+        if os.path.isdir(path):
             inside = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
             found = [entry for entry in inside if _is_cloud(entry)]
             if not found:
                 raise InputError(f"{one_line(path)}: {_instead_of_clouds(path, inside)}")
             clouds += found
             skipped += [entry for entry in inside if entry.is_file() and entry not in found]
-        elif not path.exists() and glob.has_magic(text):
+        elif not os.path.exists(path) and glob.has_magic(text):
             names = sorted(glob.glob(text))  # noqa: PTH207  (it knows absolute patterns)
             matches = [Path(name) for name in names if not Path(name).name.startswith(".")]
             found = [match for match in matches if _is_cloud(match)]
@@ -57,7 +58,7 @@ def cloud_files(given: Sequence[str]) -> tuple[list[Path], list[Path]]:
 
 def holds_images(folder: Path) -> bool:
     """Whether a folder is one of images, rather than of clouds."""
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         return False
     names = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     return any(_suffix(name) in (*IMAGES, *PHOTOS) for name in names) and not any(_is_cloud(name) for name in names)
@@ -66,11 +67,11 @@ def holds_images(folder: Path) -> bool:
 def check_images(folder: Path) -> None:
     """InputError where what was given as a folder of depth images is something else."""
     shown = one_line(folder)
-    if folder.is_file():
+    if os.path.isfile(folder):
         if _is_cloud(folder):
             raise InputError(f"{shown}: a point cloud, which needs no reconstruction; use phytofit run {shown}")
         raise InputError(f"{shown}: a file, expected the folder that holds the depth images")
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise InputError(f"{shown}: no such folder; check the path")
     inside = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     suffixes = {_suffix(entry) for entry in inside}
@@ -86,7 +87,7 @@ def _check_kind(path: Path) -> None:
     shown = one_line(path)
     if _suffix(path) in PHOTOS:
         raise InputError(f"{shown}: a photo, expected a point cloud; {FROM_PHOTOS}")
-    if _suffix(path) in IMAGES and path.exists():
+    if _suffix(path) in IMAGES and os.path.exists(path):
         raise InputError(f"{shown}: an image, expected a point cloud; {FROM_DEPTH}")
 
 

@@ -37,15 +37,20 @@ ARGUMENTS = {  # with which a message of the library may begin, and the option t
 }
 ASCII = {"–": "-", "−": "-", "×": "x", "°": " deg"}
 ADVICE = {  # of the library, and the option that follows it
-    r"\bname another folder\b": "--out",
+    r"\bchoose another folder\b": "--out",
+    r"\bneeds its camera\b": "--camera",
+    r"\bname the right camera\b": "--camera",
     r"\bstate its unit\b": "--units",
-    r"\bstate up\b": "--up",
+    r"\bstate the unit of depths\b": "--depth-unit",
+    r"\b[Ss]tate up\b": "--up",
+    r"\bname the property\b": "--labels",
+    r"\bthis looks like a whole plant\b": "phytofit run measures it",
 }
 
 
-def at_command_line(error: Exception) -> str:
-    """The library's message with the names of options."""
-    text = str(error)
+def at_command_line(said: object) -> str:
+    """What the library says, with the names of options."""
+    text = str(said)
     beginning = re.match(r"(\w+(?: \w+)?)(?=:| -?[\d.]+:)", text)
     if beginning and beginning[1] in ARGUMENTS:
         text = f"--{ARGUMENTS[beginning[1]]}{text[beginning.end() :]}"

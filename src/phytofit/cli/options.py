@@ -1,6 +1,7 @@
 """Options that several commands share, and how each kind of option is checked."""
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -55,7 +56,7 @@ def numeric(
 ) -> Any:
     """An option that is a finite number in a range."""
     lows = [f"{least:,g}"] if least > -math.inf else [f"above {above:,g}"] if above > -math.inf else []
-    highs = [f"{most:,.15g}"] if most < math.inf else [f"below {below:,g}"] if below < math.inf else []
+    highs = [f"{most:,}"] if most < math.inf else [f"below {below:,g}"] if below < math.inf else []
     expected = " to ".join([*lows, *highs]) or "a finite number"
     if lows and not highs:
         expected = lows[0] if above > least else f"{lows[0]} or more"
@@ -73,7 +74,7 @@ def choice(help: str, *names: str, among: Sequence[str], file: str = "", **more:
 
     def check(given: str | list[str] | None) -> str | list[str] | None:
         for value in given if isinstance(given, list) else filter(None, [given]):
-            if value not in among and not (file and (value.lower().endswith(file) or Path(value).is_file())):
+            if value not in among and not (file and (value.lower().endswith(file) or os.path.isfile(value))):
                 others = f", or a {file[1:].upper()} file" if file else ""
                 said = f"expected {', '.join(among)}{others}, got {one_line(value)!r}"
                 raise typer.BadParameter(f"{said}{meant(value, [*among])}")

@@ -63,7 +63,7 @@ def reconstruct_command(
 
     check_images(images)
     if images.resolve() == folder.resolve():
-        raise InputError(f"{folder}: the folder of the images can't hold the results; name another with --out")
+        raise InputError(f"{folder}: the folder of the images can't hold the results; choose another folder")
     with results_in(folder):
         check_reconstruction(folder)
         stages = itertools.count()

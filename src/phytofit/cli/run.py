@@ -11,7 +11,6 @@ from rich.table import Table
 
 from phytofit.cli.console import command, complain, results_in, say, show, unforeseen
 from phytofit.cli.inputs import check_images, cloud_files, holds_images
-from phytofit.cli.messages import at_command_line
 from phytofit.cli.options import (
     CAMERAS,
     CameraOption,
@@ -129,7 +128,7 @@ def _plants(context: typer.Context, sources: list[str], folder: Path) -> tuple[l
     for source in images:
         check_images(source)
         if source.resolve() == folder.resolve():
-            raise InputError(f"{folder}: the folder of the images can't hold the results; name another with --out")
+            raise InputError(f"{folder}: the folder of the images can't hold the results; choose another folder")
     only(context, FOR_CLOUDS, "for point clouds, and this is a folder of images; leave it out")
     if not context.params["camera"]:
         raise InputError(f"{images[0]}: a folder of depth images needs --camera: {', '.join(CAMERAS)}, or a TOML file")
@@ -152,7 +151,7 @@ def _run_all(plants: list[Path], settings: dict[str, Any], folder: Path) -> None
             with items.item(i, name) as told:
                 made = run(source, where, **settings, progress=_stages(told))
         except Exception as error:
-            said = at_command_line(error) if isinstance(error, PhytofitError) else unforeseen(error)
+            said = str(error) if isinstance(error, PhytofitError) else unforeseen(error)
             complain(said if str(source) in said or source.name in said else f"{source}: {said}")
             continue
         tables.append(made.table if alone else made.table.assign(cloud=name))
