@@ -167,12 +167,11 @@ def write_workbook(path: Path, table: pd.DataFrame) -> None:
                 cell.font = Font(bold=r == 1)
             elif not pd.isna(value):
                 sheet.cell(r, c, value)
-    with io.BytesIO() as made:
-        book.save(made)
-        content = _without_times(made.getvalue())
     check_made(path, _is_our_workbook)
+    made = io.BytesIO()
     with whole_file(path) as part:
-        part.write_bytes(content)
+        book.save(made)  # by way of temporary files
+        part.write_bytes(_without_times(made.getvalue()))
 
 
 def _plain(table: pd.DataFrame) -> pd.DataFrame:
