@@ -9,7 +9,7 @@ from injection import DELETIONS, Killed, files_in, injected, is_hidden
 
 from phytofit.results import replacing
 
-SAMPLE = 9  # in the daily tests every so many-th write fails
+SAMPLE = 15  # in the daily tests every so many-th write fails
 
 
 @pytest.fixture(scope="module")
