@@ -222,6 +222,13 @@ def test_what_spreadsheets_do_to_a_table(tmp_path):
     assert values(read(tmp_path, '"sep=,"\n' + "cloud,leaf_length_cm,leaf angle\na,47.9,79\nb,72,\n")) == HAND
     assert values(read(tmp_path, "Greenhouse, May\n\n# by hand\n" + "\n\n".join(f"{row};;" for row in rows))) == HAND
     assert values(read(tmp_path, "\r".join(rows).encode("mac-roman"))) == HAND
+    assert values(read(tmp_path, 'cloud, leaf_length_cm, leaf angle\na, "47,9", 79\nb, 72,\n')) == HAND
+    named_rows = read(tmp_path, '"","cloud","leaf_length_cm","leaf angle"\n"1","a",47.9,79\n"2","b",72,NA\n')  # of R
+    assert values(named_rows) == HAND
+    assert named_rows.attrs["notes"] == ()
+    merged = read(tmp_path, "cloud,leaf_length_cm,,leaf angle\na,47.9,48.1,79\nb,72,,\n")
+    assert values(merged) == HAND
+    assert merged.attrs["notes"] == ("column 3 is not read: it has no name",)
     quoted = "cloud,leaf_length_cm,leaf_angle\n" + '"a","47,9","79"\n"b","72",""\n'
     assert values(read(tmp_path, quoted)) == HAND
 

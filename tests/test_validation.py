@@ -228,6 +228,7 @@ def test_how_far_many_repeats_differ_is_said(tmp_path):
         ("C:\\scans\\Leaf B.LAZ", "leaf_b"),
         ("a/x.ply", "a_x"),
         ("plant 7", "Plant_007"),
+        ("3.0", "0003"),
     ],
 )
 def test_a_cloud_is_found_by_a_name_that_is_written_otherwise(hand, result):

@@ -148,6 +148,7 @@ def _exact(name: str) -> str:
 
 def _as_path(name: str) -> str:
     text = unicodedata.normalize("NFKC", _exact(name).removeprefix("'").casefold()).replace("\\", "/")
+    text = re.sub(r"^(\d+)\.0+$", r"\1", text)  # a number that a program took for a measure
     return next((text.removesuffix(suffix) for suffix in READERS if text.endswith(suffix)), text).replace("/", "_")
 
 

@@ -81,6 +81,9 @@ def read_measures(path: str | Path) -> pd.DataFrame:
         raise InputError(f"{table.where}: {error}") from None
     if len(clouds) > 1 and (others := [table.names[i] for i in clouds[1:] if not _says_which(table, i)]):
         unread.append(f"clouds are named by column {quoted(table.names[clouds[0]])}; {listed(others)} is not read")
+    for i, name in enumerate(table.names):
+        if i > 0 and not name and not all(is_missing(row[i]) for row in table.rows):  # the first may number the rows
+            unread.append(f"column {i + 1} is not read: it has no name")
     made = _measures(table, clouds[0], entries)
     made.attrs["notes"] = (*notes, *unread)
     return made

@@ -109,7 +109,8 @@ def _dialects(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _rows(text: str, separator: str) -> list[list[Cell]]:
-    return [list(row) for row in csv.reader(io.StringIO(text, newline=""), delimiter=separator)]
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
+    return [list(row) for row in rows]
 
 
 def _workbook(data: bytes, path: Path) -> list[Sheet]:
