@@ -20,8 +20,6 @@ def make(budget: Budget, out: Path) -> None:
     chosen += [(f"greenhouse, {p.stem}", p) for p in clouds("greenhouse") if p.stem == "0007"]
     chosen += [(f"field, {p.stem[:2]}", p) for p in clouds("field")[:1]]
     done = run_all(search, [(path, budget.search) for _, path in chosen], "Fig. 6", one_by_one=True)
-    for path in (path for _, path in chosen if path is not None and path.stem == "0007"):
-        save(phytofit.plot_fit(phytofit.fit(read(path)), "0007"), out / "fit_0007.png")  # the README's picture
     stages(chosen, done, out)
     spread(chosen, done, out)
 

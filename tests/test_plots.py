@@ -269,6 +269,7 @@ def test_text_fits(text, width, most):
         ((47.5, 47.07, 47.93), ("47.50", "47.07–47.93")),
         ((58.0, 47.8, 69.7), ("58", "48–70")),
         ((3.556, 3.461, 3.652), ("3.56", "3.46–3.65")),
+        ((4.8, 1.6, 10.2), ("4.8", "1.6–10.2")),
         ((0.4321, None, None), ("0.432", "")),
         ((24.0, 22.0, None), ("24.0", "≥ 22.0")),
         ((24.0, None, float("nan")), ("24.0", "")),
@@ -290,6 +291,7 @@ def test_numbers_are_as_precise_as_their_intervals(values, expected):
         ("the leaf ends bluntly: if its tip was not seen, it is longer", "the leaf ends bluntly"),
         ("not fitted: no stem was found: expected a stem", "not fitted: no stem was found"),
         ("only 38 % of the leaf was seen", "only 38 % of the leaf was seen"),
+        ("the stem was seen from one side (180° of it): it may be off. Scan", "the stem was seen from one side"),
         ("width 3.5 cm is off. Measure again.", "width 3.5 cm is off"),
     ],
 )

@@ -210,8 +210,9 @@ def folded(text: object, width: float, most: int, size: float = SMALL, *, bold: 
 
 
 def in_short(remark: str) -> str:
-    """What a remark says was seen, without what follows from it; a clause of two words takes the next along."""
-    clauses = re.split(r"(?<=[:;.])\s+", remark.strip())
+    """What a remark says was seen, without brackets and what follows from it; a clause of two words takes the next
+    along."""
+    clauses = re.split(r"(?<=[:;.])\s+", re.sub(r"\s*\([^()]*\)", "", remark).strip())
     kept = " ".join(clauses[: 2 if len(clauses[0].split()) <= 2 else 1])
     return kept.rstrip(":;.")
 
@@ -220,7 +221,7 @@ def digits(value: float, low: float | None, high: float | None) -> int:
     """Decimals that a value deserves: its last digit is at most a fifth of half its interval; without one, three digits
     are kept."""
     ends = [end for end in (low, high) if end is not None and np.isfinite(end)]
-    off = max((abs(end - value) for end in ends), default=0.0)
+    off = sum(abs(end - value) for end in ends) / max(len(ends), 1)
     step = 0.2 * off if off > 0.0 else 0.01 * abs(value)
     if not np.isfinite(step) or step == 0.0:
         return 1

@@ -47,10 +47,10 @@ STEM_COLOR, UNKNOWN_COLOR, MIDRIB_COLOR = "#222222", "#C4C4C4", "#111111"
 MOST_DRAWN = 30_000  # points of a plant
 HIGHEST_IN = 8.4  # of the views of a plant
 MEASURED = {"leaf_length": "length", "leaf_width": "width", "leaf_angle": "angle"}  # of each leaf
-TABLE_IN = 4.6  # width of the tables, and of their columns
-PLANT_IN = (1.5, 1.0, 2.1)
-LEAVES_IN = (0.46, 0.86, 0.86, 0.86, 1.56)
-SEGMENTED_IN = (0.46, 1.1, 0.74, 2.3)
+TABLE_IN = 4.9  # width of the tables, and of their columns
+PLANT_IN = (1.6, 1.1, 2.2)
+LEAVES_IN = (0.46, 0.86, 0.86, 0.86, 1.86)
+SEGMENTED_IN = (0.46, 1.1, 0.74, 2.6)
 BESIDE_IN, STRIP_IN = 3.4, 0.25  # width of what stands beside a reconstruction; height of its strip of colours
 MOST_REMARKS = 12  # of a reconstruction
 MOST_LINES = 3  # of what is to check of a leaf
@@ -216,8 +216,9 @@ def _value(rows: pd.DataFrame, unit: str = "") -> tuple[Line, ...]:
 
 
 def _remarks(flags: Sequence[str], width: float) -> tuple[Line, ...]:
-    """What the flags say was seen, in a few lines."""
-    said = "; ".join(dict.fromkeys(in_short(flag) for flag in flags))
+    """What the flags say was seen, in a few lines; that there is no fit comes first."""
+    ordered = sorted(flags, key=lambda flag: not flag.startswith("not fitted"))
+    said = "; ".join(dict.fromkeys(in_short(flag) for flag in ordered))
     return tuple(Line(text) for text in folded(said, width - 0.12, MOST_LINES)) or (Line("–", color=GREY),)
 
 
