@@ -32,7 +32,7 @@ LAYERS = [
     {"flags"},
     {"likelihood", "objectives", "pose"},
     {"distances", "hidden"},
-    {"intervals", "optimize", "traits", "voids"},
+    {"intervals", "optimize", "traits", "unexplained", "voids"},
     {"species"},
     {"models"},
     {"cloud"},

@@ -231,3 +231,12 @@ def test_bands_in_which_no_points_are_expected_say_nothing_of_unevenness():
         assert leaf_end._unevenness(np.full(100, 5.5), expected, steps) == 1.0
         uneven = leaf_end._unevenness(np.repeat([5.5, 30.5], 50), expected + 1e-3, steps)
     assert 1.0 <= uneven < np.inf
+
+
+def test_a_strip_that_ends_before_all_points_is_improbable_not_undefined():
+    """As of points on a lattice, of which those near the end are all beyond the strip that is tried."""
+    middles = 0.5 * (np.arange(20.0) + 0.5)
+    steps = leaf_end._Steps(middles, 0.5, np.ones(20))
+    fits = leaf_end._of_strips(np.array([0.4, 4.0]), np.array([2.9, 3.0, 3.1]), np.array([-1.0, 0.0, 1.0]), steps)
+    assert np.isfinite(fits).all()
+    assert fits[0].max() < fits[1].max()

@@ -211,21 +211,29 @@ def test_one_point():
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"n_points": 0}, r"points: expected a number of 1 or more, got 0"),
-        ({"n_points": -5}, r"points: expected a number of 1 or more, got -5"),
+        ({"n_points": 0}, r"points: expected a whole number of 1 or more, got 0"),
+        ({"n_points": -5}, r"points: expected a whole number of 1 or more, got -5"),
         ({"noise_cm": -0.1}, r"noise: expected a number of 0 or more, got -0\.1"),
         ({"noise_cm": np.nan}, r"noise: expected a number of 0 or more, got nan"),
         ({"noise_cm": np.inf}, r"noise: expected a number of 0 or more, got inf"),
-        ({"n_spheres": -1}, r"spheres: expected a number of 0 or more, got -1"),
+        ({"n_spheres": -1}, r"spheres: expected a whole number of 0 or more, got -1"),
         ({"sphere_diameter_cm": 0.0}, r"sphere diameter: expected a positive number of cm, got 0"),
-        ({"sphere_diameter_cm": np.nan}, r"sphere diameter: expected a positive number of cm, got nan"),
+        ({"sphere_diameter_cm": np.nan}, r"sphere diameter: expected a number of 0 or more, got nan"),
         ({"outlier_share": 1.0}, r"outliers: expected a share from 0 to below 1, got 1"),
-        ({"outlier_share": -0.5}, r"outliers: expected a share from 0 to below 1, got -0\.5"),
-        ({"outlier_share": np.nan}, r"outliers: expected a share from 0 to below 1, got nan"),
+        ({"outlier_share": -0.5}, r"outliers: expected a number of 0 or more, got -0\.5"),
+        ({"outlier_share": np.nan}, r"outliers: expected a number of 0 or more, got nan"),
         ({"fixed": {"leaf_colour": 3.0}}, r"no parameter is called 'leaf_colour'; there are stem_diameter, "),
         ({"fixed": {"leaf_angle": 181.0}}, r"leaf_angle: .*within the species' bounds \[0, 180\], got 181"),
-        ({"fixed": {"leaf_length": np.nan}}, r"leaf_length: .*within the species' bounds \[5, inf\], got nan"),
+        ({"fixed": {"leaf_length": np.nan}}, r"leaf_length: .*within the species' bounds \[5, 10000\], got nan"),
         ({"fixed": {"stem_diameter": -1.0}}, r"stem_diameter: .*within the species' bounds"),
+        ({"fixed": {"leaf_length": np.inf}}, r"leaf_length: .*within the species' bounds \[5, 10000\], got inf"),
+        ({"fixed": {"leaf_length": True}}, r"leaf_length: .*within the species' bounds .*, got True"),
+        ({"fixed": {"leaf_length": "long"}}, r"leaf_length: .*within the species' bounds .*, got 'long'"),
+        ({"n_points": True}, r"points: expected a whole number of 1 or more, got True"),
+        ({"n_points": 10**15}, r"points: expected 10,000,000 at most, got 1,000,000,000,000,000"),
+        ({"n_views": 2.5}, r"views: expected a whole number of 1 or more, got 2\.5"),
+        ({"noise_cm": 1e300}, r"noise: expected 10000 at most, got 1e\+300"),
+        ({"seed": 0.5}, r"seed: expected a whole number of 0 or more, got 0\.5"),
     ],
 )
 def test_bad_settings_are_named(settings, message):
@@ -275,5 +283,5 @@ def test_more_cameras_see_more_and_all_points_asked_for_come():
 
 @pytest.mark.parametrize(("setting", "value"), [("n_views", 0), ("noise_reach_cm", -1.0)])
 def test_a_sensor_that_can_not_be_is_refused(setting, value):
-    with pytest.raises(SettingError, match="expected a number"):
+    with pytest.raises(SettingError, match=r"expected a (whole )?number"):
         simulate(**{setting: value})

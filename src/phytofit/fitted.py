@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from phytofit.display import Shown, Summary
 from phytofit.errors import NoPhytomerError, Status
-from phytofit.flags import flags_of
+from phytofit.flags import FEW_ON_STEM, ONE_LEAF_ONLY, UNUSABLE, flags_of
 from phytofit.intervals import Ends, propagated
 from phytofit.models import STEM, Organ, move
 from phytofit.objectives import Registration
@@ -26,6 +26,13 @@ __all__ = ["Fit", "beside_its_rival", "remarked"]
 
 FloatArray = NDArray[np.float64]
 LEAST_ON_STEM = 10.0  # points; with fewer it is no stem
+THIN = 2.0  # spreads of the prior, by which a stem is thinner than expected
+MUCH_ELSEWHERE = (
+    0.12  # share of the points; phytomers have up to 0.04, with leaves of others or of no plant 0.2 and more
+)
+SPARSE = 0.4  # of the leaf's density of points; a stem seen from one side has half
+NO_STEM = "no stem in this cloud: what looks most like one has {:.0f} points that may as well be the leaf's"
+MORE_THAN_ONE_LEAF = "{:.0f} % of the points lie on surfaces that are neither the fitted stem nor the fitted leaf"
 INTERVAL_METHOD = "sandwich interval"
 OPEN_WITHOUT_TIP = ("leaf_length", "leaf_area")  # no upper end where the tip was not seen
 TOLD_OF_RIVALS = ("stem_diameter", "leaf_length", "leaf_angle", "leaf_width")
@@ -206,8 +213,13 @@ class Fit(Shown):
         return dict(zip(self.species.space.names, scaled, strict=False))
 
 
-def remarked(result: Fit) -> Fit:
-    """The result with the flags of what it rests on; NoPhytomerError where it rests on no stem or no leaf."""
+def remarked(result: Fit, *, labelled: bool = False) -> Fit:
+    """The result with the flags of what it rests on; NoPhytomerError where the cloud holds no stem, no leaf, or more
+    than one leaf on its piece of stem.
+
+    Of clouds that are `labelled` it is known what is stem and what is leaf.  Where a seed point said which leaf is
+    meant, what else there is, is a flag.
+    """
     made = result.estimate
     if made is None:
         return result
@@ -217,7 +229,16 @@ def remarked(result: Fit) -> Fit:
             f"no stem with a leaf was found: the best fit has {made.sighting.stem_points:.0f} points on its stem and a "
             f"leaf of {length:.3g} cm"
         )
-    flags = flags_of(
+    flags: list[str] = []
+    if not labelled:
+        if _lacks_stem(result, made):
+            raise NoPhytomerError(NO_STEM.format(made.sighting.stem_points))
+        if made.sighting.elsewhere > MUCH_ELSEWHERE:
+            text = MORE_THAN_ONE_LEAF.format(100.0 * made.sighting.elsewhere)
+            if result.settings.get("seed_point") is None:
+                raise NoPhytomerError(f"this looks like a whole plant, or more than one leaf: {text}; {ONE_LEAF_ONLY}")
+            flags.append(f"{UNUSABLE}{text}")
+    flags += flags_of(
         result.species.space,
         result.x,
         made.sighting,
@@ -230,6 +251,19 @@ def remarked(result: Fit) -> Fit:
         scale=result.scale,
     )
     return replace(result, flags=(*result.flags, *flags))
+
+
+def _lacks_stem(result: Fit, made: Estimate) -> bool:
+    """Whether what was fitted as a stem is none: so thin that neither its points nor the species speak for it, thinner
+    than they scatter and than nearly all stems are; or with few points, and these far apart beside the leaf's, some of
+    which a stem takes over that stands where there is only leaf."""
+    place = result.species.space.index("stem_diameter")
+    expected, diameter = result.species.space.parameters[place], float(result.x[place])
+    thin = 0.5 * diameter < made.noise[0] and diameter < expected.mean - THIN * expected.std
+    stem, leaf = (float(organ.area) for organ in result._organs_of(result.x))
+    seen = made.sighting
+    sparse = seen.stem_points * leaf < SPARSE * seen.leaf_points * stem
+    return thin or (sparse and seen.stem_points < FEW_ON_STEM)
 
 
 def beside_its_rival(result: Fit) -> Fit:

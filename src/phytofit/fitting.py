@@ -1,6 +1,7 @@
 """The one loop: cloud -> start pose -> search -> Fit."""
 
 import inspect
+import math
 import os
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
@@ -17,7 +18,7 @@ from phytofit.errors import SettingError, Status
 from phytofit.fitted import Fit, beside_its_rival, remarked
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation
-from phytofit.parsing import parse_points, parse_up
+from phytofit.parsing import checked_flag, checked_number, checked_whole, parse_points, parse_up
 from phytofit.pose import StartPose
 from phytofit.posterior import DITHER_CM, estimate
 from phytofit.preparation import Prepared, prepare
@@ -81,7 +82,8 @@ def fit(
     threads : how many to work with; as many as there are cores by default
     progress : called after each generation with what it left
 
-    Raises InputError (a ValueError) for what can't be used, NoPhytomerError where there is no stem with a leaf.
+    Raises InputError (a ValueError) for what can't be used, NoPhytomerError where there is no stem with a leaf,
+    or more than one leaf.
     """
     if method not in METHODS:
         raise SettingError(f"method: expected one of {', '.join(METHODS)}, got {method!r}")
@@ -89,9 +91,16 @@ def fit(
         raise SettingError(f"distance: expected with method 'paper' only, got {distance!r} with {method!r}")
     if distance is not None and distance not in DISTANCES:
         raise SettingError(f"distance: expected one of {', '.join(DISTANCES)}, got {distance!r}")
-    for name, value, least in (("points", n_points, 100), ("seed", seed, 0), ("threads", threads, 1)):
-        if value is not None and value < least:
-            raise SettingError(f"{name}: expected {least} or more, got {value}")
+    counts = ("points", n_points, 100), ("samples", n_samples, 1), ("generations", n_generations, 1)
+    for name, value, least in (*counts, ("threads", threads, 1)):
+        if value is not None:
+            checked_whole(name, value, least)
+    checked_whole("seed", seed, 0, math.inf)
+    for name, number in (("elite_fraction", elite_fraction), ("covariance_noise", covariance_noise)):
+        checked_number(name, number)
+    checked_flag("random_start", random_start)
+    if not isinstance(species, Species | str | os.PathLike):
+        raise SettingError(f"species: expected a name, a file or a Species, got {species!r}")
     direction = parse_up(up)
     seed_points = None if seed_point is None else parse_points(seed_point)
     species = species if isinstance(species, Species) else load_species(os.fspath(species))
@@ -134,7 +143,9 @@ def fit(
             "seed_point": None if seed_points is None else seed_points.tolist(),
         },
     )
-    return remarked(_beside_its_stem(_right_way_up(beside_its_rival(result), direction), found))
+    labelled = found.organ is not None and bool((found.organ == 0).any() and (found.organ == 1).any())
+    result = _beside_its_stem(_right_way_up(beside_its_rival(result), direction), found)
+    return remarked(result, labelled=labelled)
 
 
 def fit_paper(

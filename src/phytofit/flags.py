@@ -11,8 +11,20 @@ from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import LEAF, Organ, move
 from phytofit.parameters import ParameterSpace
 from phytofit.traits import measure
+from phytofit.unexplained import on_something_else
 
-__all__ = ["OFFSET", "Sighting", "across_leaf", "along_stem", "clearly_lacking", "flags_of", "sighting", "strip_of"]
+__all__ = [
+    "FEW_ON_STEM",
+    "OFFSET",
+    "UNUSABLE",
+    "Sighting",
+    "across_leaf",
+    "along_stem",
+    "clearly_lacking",
+    "flags_of",
+    "sighting",
+    "strip_of",
+]
 
 FloatArray = NDArray[np.float64]
 N_SECTIONS = 20  # of the leaf, of equal area
@@ -33,6 +45,8 @@ LITTLE_EXPLAINED = 0.1  # share of outliers that is worth a remark
 MUCH_NOISE_CM = 1.0
 BLURRED = 2.0  # stem noises in a stem's radius, below which a tube can't be told from a filled stem
 EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which the width is not resolved
+UNUSABLE = "unusable: "  # with which a flag begins that says not to use the numbers
+ONE_LEAF_ONLY = "use phytofit.run for a whole plant, or give a seed point on the leaf that is meant"
 OFFSET = "collar_offset"  # the parameter that says where a leaf starts, in the stem or at its surface
 RISES = 0.02  # of a leaf's length, which the stem's surface hides and it may be longer, that is worth a remark
 IMPLAUSIBLE = 4.0  # spreads of the prior
@@ -60,7 +74,8 @@ class Sighting:
     by chance; ``end`` share of the midrib at which the leaf's last point lies, and ``short`` how many more would be
     expected beyond it; ``along_stem`` cm of the midrib that lie inside the stem, but so near its surface that they may
     as well be outside; ``leaf_points`` number of points on the leaf; ``base`` whether its start, as fitted, lies in
-    no void, however large that may be, and the prior of where that is did not count more often.
+    no void, however large that may be, and the prior of where that is did not count more often; ``elsewhere`` share of
+    all points that are of no organ, and too crowded for outliers: they lie on something else.
     """
 
     sections: FloatArray
@@ -73,6 +88,7 @@ class Sighting:
     along_stem: float = 0.0
     leaf_points: float = np.inf
     base: bool = True
+    elsewhere: float = 0.0
 
     @property
     def leaf(self) -> float:
@@ -87,7 +103,7 @@ class Sighting:
 
 def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Sighting:
     """What of the phytomer the cloud shows; scores (n, k) of the points as `state` gives them."""
-    on_stem, on_leaf, _ = state.belongs(scores)
+    on_stem, on_leaf, outlier = state.belongs(scores)
     pose = likelihood.pose_of(state)
     points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]  # in the model's frame
     leaf = likelihood.model.organs(state.x)[1].row(0)
@@ -116,6 +132,7 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
         risen,
         float(on_leaf.sum()),
         bool(likelihood.prior_weight.max() == 1.0) and (void is None or bool(void.larger().at(start) < HIDDEN_BASE)),
+        np.count_nonzero(on_something_else(points[outlier > 0.5], likelihood.outlier_density)) / len(points),
     )
 
 

@@ -28,6 +28,7 @@ STEP = 1e-4  # for derivatives of the tip
 CLEARLY = 2.0  # standard errors
 MISFIT = 0.018  # of the length, by which the model's end is off, of real leaves: benchmarks/leaf_ends.py
 N_BANDS = 8  # of as many expected points each, by which it is told how unevenly they lie
+NOTHING = 1e-12  # of a strip that ends before all its points
 STRAY = 1e-9  # density of points that the strip does not explain, in units of the noise
 
 
@@ -96,6 +97,8 @@ def points_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     middle, spread = _median_and_spread(ends, fits / uneven)
     ends = middle + max(spread, 0.5 * float(ends[1] - ends[0])) * np.linspace(-4.0, 4.0, N_ENDS)
     ends = ends[ends > NEAREST_END * far]
+    if len(ends) < 2:  # nearer than the strip begins
+        return None
     middle, spread = _median_and_spread(ends, _of_strips(ends, along, lateral, steps) / uneven)
     return PointsEnd(start + middle * noise, spread * noise)
 
@@ -121,7 +124,7 @@ def _of_strips(ends: FloatArray, along: FloatArray, lateral: FloatArray, steps: 
             left = np.clip(1.0 - places / end, 0.0, 1.0)
             for j, power in enumerate(POWERS):
                 profile = left**power
-                variance = np.sum(lateral**2 - noise**2) / np.sum(profile[:, 0] ** 2)
+                variance = np.sum(lateral**2 - noise**2) / max(np.sum(profile[:, 0] ** 2), NOTHING)
                 half = np.sqrt(3.0 * max(variance, 0.01)) * WIDTHS[:, np.newaxis, np.newaxis]
                 edge = half * profile
                 inside = (ndtr((edge + sideways) / noise) - ndtr((sideways - edge) / noise)) @ SHARES

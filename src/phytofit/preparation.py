@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phytofit.cloud import PointCloud, remove_outliers, size_cm, thin
+from phytofit.errors import NoPhytomerError
+from phytofit.flags import ONE_LEAF_ONLY
 from phytofit.meant import meant_points
 from phytofit.ordering import canonical_order
 from phytofit.pose import StartPose, start_poses
@@ -17,6 +19,7 @@ __all__ = ["Prepared", "prepare"]
 FloatArray = NDArray[np.float64]
 N_LOOKED_AT = 100_000  # points, if they are all kept for the fit, in which the stem is looked for
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
+STUB = 0.1  # of the points of the largest labelled leaf, up to which another is but a stub
 OTHERS_TOUCH = (
     "other leaves touch this one or its stem: leaf angle, leaf width and stem diameter may be off. Cut them away"
 )
@@ -75,6 +78,8 @@ def prepare(
         left_out = f"{len(cloud) - len(meant)} of {len(cloud)} points left out: not of a seed point's leaf"
         flags = (OTHERS_TOUCH, *found.flags) if others_touch else found.flags
         return replace(found, notes=(left_out, *found.notes), flags=flags)
+    if cloud.labels is not None:
+        _check_one_leaf(cloud.labels)
     starts = find_starts(clean.points / scale)
     home = starts[0].pose
     upright = np.round((used.points / scale - home[:3, 3]) @ home[:3, :3], CANONICAL_DECIMALS)
@@ -108,6 +113,16 @@ def _rigid_inverse(pose: FloatArray) -> FloatArray:
 def _organ_numbers(labels: NDArray[np.int64]) -> NDArray[np.int8]:
     """Labels count 0 unknown, 1 stem, 2.. leaves; organs 0 stem, 1 leaf, -1 unknown."""
     return np.clip(labels - 1, -1, 1).astype(np.int8)
+
+
+def _check_one_leaf(labels: NDArray[np.int64]) -> None:
+    """NoPhytomerError if labels (n,) name a second leaf that is more than a stub beside the first."""
+    counts = np.unique(labels[labels > 1], return_counts=True)[1]
+    n_leaves = np.count_nonzero(counts > STUB * counts.max(initial=0))
+    if n_leaves > 1:
+        raise NoPhytomerError(
+            f"the labels name {n_leaves} leaves, expected one leaf on its piece of stem; {ONE_LEAF_ONLY}"
+        )
 
 
 def _what_was_left_out(n_read: int, n_clean: int, n_kept: int) -> list[str]:

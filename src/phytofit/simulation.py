@@ -1,7 +1,9 @@
 """Simulated phytomers: true organs to a cloud, with noise, removed spheres, outliers and a random pose."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Real
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from phytofit.errors import SettingError
 from phytofit.models import Organ, SurfaceSampler, move
+from phytofit.parsing import checked_number, checked_whole
 from phytofit.species import Species, load_species
 
 __all__ = ["SimulatedPhytomer", "add_noise", "add_outliers", "occlude", "random_pose", "simulate", "visible"]
@@ -18,6 +21,7 @@ CAMERA_ABOVE_DEG = 20.0  # the cameras of `n_views` are so much above the horizo
 SPARE = 8  # times as many points are drawn as cameras are to see
 SCREEN_POINTS, PIXEL_CM = 250_000, 0.1  # of the depth buffer; some five points a pixel
 BEHIND_CM = 0.4  # so far behind the nearest point of its pixel a point is still of the same surface, seen at a slant
+MOST_CM = 10_000.0  # of any length of a phytomer; a plant is no longer than 100 m
 AT_ONCE = 1000  # points, whose neighbours are listed
 ABOVE = "stem_length_above"
 OUTLIER_MARGIN = 0.25  # outliers fill the cloud's box, grown by this share of its size
@@ -60,19 +64,18 @@ def simulate(
     spaced around the stem and looking down on it by `CAMERA_ABOVE_DEG`; None: from everywhere.
     """
     species = load_species() if species is None else species
-    for name, value, low in (
+    for name, count, least in (
         ("points", n_points, 1),
-        ("noise", noise_cm, 0),
-        ("noise reach", noise_reach_cm, 0),
         ("views", 1 if n_views is None else n_views, 1),
         ("spheres", n_spheres, 0),
-        ("seed", seed, 0),
     ):
-        if not (np.isfinite(value) and value >= low):
-            raise SettingError(f"{name}: expected a number of {low} or more, got {value:g}")
-    if not (np.isfinite(sphere_diameter_cm) and sphere_diameter_cm > 0):
+        checked_whole(name, count, least)
+    checked_whole("seed", seed, 0, math.inf)
+    for name, length in (("noise", noise_cm), ("noise reach", noise_reach_cm), ("sphere diameter", sphere_diameter_cm)):
+        checked_number(name, length, most=MOST_CM)
+    if not sphere_diameter_cm > 0:
         raise SettingError(f"sphere diameter: expected a positive number of cm, got {sphere_diameter_cm:g}")
-    if not 0 <= outlier_share < 1:
+    if not checked_number("outliers", outlier_share) < 1:
         raise SettingError(f"outliers: expected a share from 0 to below 1, got {outlier_share:g}")
     random = np.random.default_rng(seed)
     space = species.space
@@ -82,10 +85,10 @@ def simulate(
     fixed = {} if fixed is None else fixed
     for name, value in fixed.items():
         i = space.index(name)
-        if not space.lower[i] <= value <= space.upper[i]:
+        low_end, high_end = float(space.lower[i]), min(float(space.upper[i]), MOST_CM)
+        if isinstance(value, bool) or not isinstance(value, Real) or not low_end <= float(value) <= high_end:
             raise SettingError(
-                f"{name}: expected a number within the species' bounds [{space.lower[i]:g}, {space.upper[i]:g}], "
-                f"got {value:g}"
+                f"{name}: expected a number within the species' bounds [{low_end:g}, {high_end:g}], got {value!r}"
             )
         x[i] = value
     model = species.with_stem_above(stem_above).model
