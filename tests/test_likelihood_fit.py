@@ -261,7 +261,7 @@ def no_phytomers():
         "sphere": 20.0 * ball,
         "small sphere": 5.0 * ball,
         "bare stem": tube,
-        "blade": random.uniform(-1, 1, (3000, 3)) * [30.0, 3.0, 0.1],
+        "blade": random.uniform(-1, 1, (800, 3)) * [30.0, 3.0, 0.1],
     }
 
 
