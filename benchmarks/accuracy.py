@@ -25,9 +25,10 @@ import numpy as np
 from common import DATA, clouds, progress, read, run_parts
 
 import phytofit
+import phytofit.models
 from phytofit.species import STEM_ABOVE
 
-PARAMETERS = phytofit.Phytomer.PARAMETERS[:6]  # of Eq. (1)
+PARAMETERS = phytofit.models.Phytomer.PARAMETERS[:6]  # of Eq. (1)
 HAND = {
     "stem_diameter": "stem_diameter_cm",
     "leaf_angle": "leaf_angle_deg",

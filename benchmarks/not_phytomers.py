@@ -28,6 +28,7 @@ from robustness import HOLES, NOISE, OUTLIERS, POINTS, SWEEPS, TIPS, VIEWS
 from scipy.spatial.transform import Rotation
 
 import phytofit
+import phytofit.simulation
 from phytofit.cloud import size_cm
 from phytofit.flags import UNUSABLE
 from phytofit.simulation import random_pose
@@ -79,7 +80,7 @@ def real_plants() -> Iterator[Plant]:
     for folder in sorted((DATA.parent / "openalea_synthetic_maize").iterdir()):
         mesh = trimesh.load(folder / "synthetic_plant.ply", process=False)
         points = np.asarray(trimesh.sample.sample_surface(mesh, MOST, seed=0)[0])
-        yield Plant(folder.name, phytofit.add_noise(points, 0.3, np.random.default_rng(0)), None)
+        yield Plant(folder.name, phytofit.simulation.add_noise(points, 0.3, np.random.default_rng(0)), None)
 
 
 def thinned(plant: Plant) -> Plant:

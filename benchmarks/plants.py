@@ -27,6 +27,7 @@ from segment import score
 from trust import Leaf, maize_leaves
 
 import phytofit
+import phytofit.simulation
 from phytofit.pipeline import run
 from phytofit.simulation import visible
 
@@ -193,7 +194,7 @@ def plant_errors(folder: Path, leaves: list[Leaf], sided: bool) -> list[tuple[fl
         seen = [visible(surface, surface, np.array([np.cos(t), np.sin(t), 0.36])) for t in turns]
         points = surface[np.any(seen, axis=0)]
     random = np.random.default_rng(0)
-    points = phytofit.add_noise(points[random.permutation(len(points))[:N_POINTS]], NOISE_CM, random)
+    points = phytofit.simulation.add_noise(points[random.permutation(len(points))[:N_POINTS]], NOISE_CM, random)
     with tempfile.TemporaryDirectory() as out:
         file = Path(out) / "plant.ply"
         phytofit.write_cloud(file, phytofit.from_points(points, "cm", plausible_cm=(1.0, 1000.0)))

@@ -30,6 +30,7 @@ from scipy.spatial.transform import Rotation
 from trust import covers
 
 import phytofit
+import phytofit.simulation
 
 PICTURE = Path(__file__).parents[1] / "docs" / "images" / "robustness.png"
 SPECIES = phytofit.load_species()
@@ -77,7 +78,7 @@ def along_leaf(made: phytofit.SimulatedPhytomer) -> np.ndarray:
 
 
 def with_noise(made: phytofit.SimulatedPhytomer, std_cm: float, random: np.random.Generator) -> np.ndarray:
-    return phytofit.add_noise(made.points, std_cm, random)
+    return phytofit.simulation.add_noise(made.points, std_cm, random)
 
 
 def with_holes(made: phytofit.SimulatedPhytomer, share: float, random: np.random.Generator) -> np.ndarray:
@@ -99,7 +100,7 @@ def without_tip(made: phytofit.SimulatedPhytomer, share: float, random: np.rando
 
 def with_outliers(made: phytofit.SimulatedPhytomer, share: float, random: np.random.Generator) -> np.ndarray:
     """So large a share of all points is outliers."""
-    return np.concatenate([made.points, phytofit.add_outliers(made.points, share / (1.0 - share), random)])
+    return np.concatenate([made.points, phytofit.simulation.add_outliers(made.points, share / (1.0 - share), random)])
 
 
 def from_cameras(made: phytofit.SimulatedPhytomer, views: float, random: np.random.Generator) -> np.ndarray:
@@ -318,10 +319,10 @@ def field_length(job: tuple[str, int, np.ndarray]) -> tuple[float, float, float,
     points, away, seed_point = field_points(), np.full(2, np.inf), None
     random = np.random.default_rng(number)
     if how == "noise":
-        points = phytofit.add_noise(points, 0.5, random)
+        points = phytofit.simulation.add_noise(points, 0.5, random)
     elif how == "sphere":
         center = points[np.random.default_rng(number).integers(len(points))]
-        points = points[phytofit.occlude(points, 6.0, random)]
+        points = points[phytofit.simulation.occlude(points, 6.0, random)]
         away = np.linalg.norm(center - midrib[[0, -1]], axis=1)
     elif how == "pieces":
         crowded, seed_point = among_pieces(points, random), midrib[list(SEEDED)]  # it has gaps: one for each piece

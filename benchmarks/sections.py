@@ -41,6 +41,7 @@ from tape_measure import (
 from trust import covers, fit_real, interval
 
 import phytofit
+import phytofit.models
 from phytofit.models import move
 from phytofit.traits import CHORD_CM
 
@@ -53,7 +54,7 @@ class Cloud(NamedTuple):
     """A cloud, upright as its fit has it, cut into sections, and what its points measure; `more` in words."""
 
     points: np.ndarray
-    blade: phytofit.Organ
+    blade: phytofit.models.Organ
     start: float  # along the midrib, cm, where it leaves the stem
     traits: dict[str, phytofit.Trait]
     hand: dict[str, float]

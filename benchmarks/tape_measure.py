@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 import phytofit
+import phytofit.models
 
 SLAB_CM = 1.5  # thickness of a section
 STEM_REACH_CM = 3.5  # from the stem's axis: points further out are not of its section
@@ -148,7 +149,7 @@ def extent(points: np.ndarray) -> float:
     return float(np.diff(np.percentile(middle @ longest, WITHIN))[0])
 
 
-def expected_beyond(leaf: np.ndarray, blade: phytofit.Organ) -> float:
+def expected_beyond(leaf: np.ndarray, blade: phytofit.models.Organ) -> float:
     """Points that an even spread puts on the blade beyond the last of the leaf's points: about one, if it fits."""
     node_at = np.concatenate([[0.0], np.cumsum(blade.segment_lengths)])
     last = min(along(leaf, blade.axis).max(), node_at[-1])
@@ -157,7 +158,7 @@ def expected_beyond(leaf: np.ndarray, blade: phytofit.Organ) -> float:
     return float(len(leaf) * beyond / blade.area)
 
 
-def sections_of(leaf: np.ndarray, blade: phytofit.Organ, start: float) -> list[Section]:
+def sections_of(leaf: np.ndarray, blade: phytofit.models.Organ, start: float) -> list[Section]:
     """Sections across the fitted midrib every centimetre, from where it leaves the stem, at the length `start`."""
     node_at = np.concatenate([[0.0], np.cumsum(blade.segment_lengths)])
     sections = []

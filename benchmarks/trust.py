@@ -30,6 +30,8 @@ from common import DATA, clouds, progress, read, run_parts
 from scipy.spatial import cKDTree
 
 import phytofit
+import phytofit.models
+import phytofit.simulation
 from phytofit.likelihood import CloudLikelihood
 from phytofit.models.organs import frames_along
 
@@ -68,7 +70,7 @@ def fit_simulated(job: Job) -> Row:
     made = phytofit.simulate(SPECIES, n_points=job.n_points, noise_cm=noise, seed=seed)
     points = made.points
     if job.correlated_cm:
-        points = phytofit.add_noise(points, job.noise_cm, np.random.default_rng(seed), job.correlated_cm)
+        points = phytofit.simulation.add_noise(points, job.noise_cm, np.random.default_rng(seed), job.correlated_cm)
     result = phytofit.fit(points, "cm", seed=0, threads=1)
     truth = phytofit.measure(made.organs)
     low, high = np.array(list(result.parameter_intervals.values()))[:N_PARAMETERS].T
@@ -98,7 +100,7 @@ def cramer_rao(made: phytofit.SimulatedPhytomer, job: Job) -> np.ndarray:
     The Fisher information is the mean of the scores' outer product over many points of the true model.
     """
     random = np.random.default_rng(0)
-    points, _ = phytofit.SurfaceSampler(BOUND_SAMPLE, 1).draw(made.organs)
+    points, _ = phytofit.models.SurfaceSampler(BOUND_SAMPLE, 1).draw(made.organs)
     points = points + random.normal(0.0, job.noise_cm, points.shape)
     species = SPECIES.leading(N_PARAMETERS)
     likelihood = CloudLikelihood(species.model, species.space, points)
@@ -194,7 +196,7 @@ def real(pool: ProcessPoolExecutor) -> None:
             print(f"{'':18}" + "".join(f"{cell:>30}" for cell in cells))
 
 
-def authors_organs(theirs: dict[str, str]) -> tuple[phytofit.Organ, ...]:
+def authors_organs(theirs: dict[str, str]) -> tuple[phytofit.models.Organ, ...]:
     """Stem and leaf as the authors' generator grows them, up to where the leaf hangs down: the stem is twice its
     internode, the leaf starts at its surface, and each piece bends by 1.5 degrees more than their parameter says.  As
     the points of their clouds without noise lie, their leaf has its width up to a third of its length, is wider by a
@@ -215,7 +217,7 @@ class Leaf(NamedTuple):
 
     name: str
     points: np.ndarray
-    organs: tuple[phytofit.Organ, phytofit.Organ]
+    organs: tuple[phytofit.models.Organ, phytofit.models.Organ]
 
 
 def maize_leaves(noise_cm: float = 0.3, n_points: int = 5000) -> list[Leaf]:
@@ -240,17 +242,19 @@ def maize_leaves(noise_cm: float = 0.3, n_points: int = 5000) -> list[Leaf]:
             axis = np.zeros((len(keep), 3))
             axis[:, 2] = keep
             radius = 0.5 * np.interp(keep, nodes[:, 2], nodes[:, 3])
-            stem = phytofit.Organ("stem", axis, frames_along(axis, np.array([0.0, 1.0, 0.0])), radius)
+            stem = phytofit.models.Organ("stem", axis, frames_along(axis, np.array([0.0, 1.0, 0.0])), radius)
             sections, tip = part.vertices[np.delete(np.arange(389), 97)].reshape(4, 97, 3), part.vertices[97]
             across = sections[0] - sections[1]
             width = np.append(np.linalg.norm(across, axis=1), 0.0)
             middle = np.concatenate([sections.mean(axis=0), [tip]])
             level = across / np.maximum(width[:-1, np.newaxis], 1e-9)
-            blade = phytofit.Organ("leaf", middle, frames_along(middle, level), 0.5 * width)
+            blade = phytofit.models.Organ("leaf", middle, frames_along(middle, level), 0.5 * width)
             random = np.random.default_rng(number)
             on_stem = round(n_points * float(stem.area) / float(stem.area + part.area))
             on_leaf = trimesh.sample.sample_surface(part, n_points - on_stem, seed=number)[0]
-            points = np.concatenate([phytofit.SurfaceSampler(on_stem, number, even=False).draw([stem])[0], on_leaf])
+            points = np.concatenate(
+                [phytofit.models.SurfaceSampler(on_stem, number, even=False).draw([stem])[0], on_leaf]
+            )
             points += random.normal(0.0, noise_cm, points.shape)
             leaves.append(Leaf(f"{folder.name[-7:]} leaf {number}", points, (stem, blade)))
     return leaves

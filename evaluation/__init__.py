@@ -1,4 +1,4 @@
 """The paper's evaluation, regenerated: ``python -m evaluation``, or ``make paper``.
 
-It calls the public names of phytofit only, and the peers and the baseline without a model of ``benchmarks/``.
+It calls what the modules of phytofit offer only, and the peers and the baseline without a model of ``benchmarks/``.
 """

@@ -10,6 +10,12 @@ from cmaes import CMA
 from scipy.optimize import differential_evolution
 
 import phytofit
+import phytofit.distances
+import phytofit.fitting
+import phytofit.objectives
+import phytofit.optimize
+import phytofit.parameters
+import phytofit.preparation
 from evaluation.jobs import run_all
 from evaluation.settings import PAPERS, Budget
 from evaluation.tables import write_markdown, write_table
@@ -62,25 +68,25 @@ def ablated(what: str, number: int, settings: dict[str, int]) -> dict[str, Any]:
 
 def problem_of(
     points: np.ndarray, n_points: int
-) -> tuple[phytofit.ParameterSpace, np.ndarray, phytofit.PaperObjective]:
+) -> tuple[phytofit.parameters.ParameterSpace, np.ndarray, phytofit.objectives.PaperObjective]:
     """What is searched: the space of Eq. (1), the mean to start from, and the paper's objective on a cloud (n, 3)."""
     species = PAPERS
-    found = phytofit.prepare(phytofit.from_points(points, "cm"), species, n_points=n_points)
-    objective = phytofit.PaperObjective(
+    found = phytofit.preparation.prepare(phytofit.from_points(points, "cm"), species, n_points=n_points)
+    objective = phytofit.objectives.PaperObjective(
         species.model,
-        phytofit.Reference.of(found.points),
+        phytofit.distances.Reference.of(found.points),
         starts=[start.pose for start in found.starts],
         n_points=n_points,
     )
-    return species.space, phytofit.mean_at(found.starts[0], species), objective
+    return species.space, phytofit.fitting.mean_at(found.starts[0], species), objective
 
 
-def traits_at(objective: phytofit.PaperObjective, x: np.ndarray) -> tuple[list[phytofit.Trait], float]:
+def traits_at(objective: phytofit.objectives.PaperObjective, x: np.ndarray) -> tuple[list[phytofit.Trait], float]:
     organs = [organ.row(0) for organ in PAPERS.model.organs(x)]
     return phytofit.measure(organs), objective.register(x)[1]
 
 
-def box_of(space: phytofit.ParameterSpace, mean: np.ndarray) -> np.ndarray:
+def box_of(space: phytofit.parameters.ParameterSpace, mean: np.ndarray) -> np.ndarray:
     """Lower and upper ends (k, 2) of three prior spreads around the mean, within the bounds."""
     return np.stack(
         [np.maximum(mean - 3.0 * space.std, space.lower), np.minimum(mean + 3.0 * space.std, space.upper)], axis=1
@@ -92,7 +98,7 @@ def random_search(points: np.ndarray, settings: dict[str, int]) -> tuple[list[ph
     space, mean, objective = problem_of(points, settings["n_points"])
     best, least = mean, np.inf
     for seed in range(settings["n_generations"]):
-        xs = phytofit.CrossEntropy(space, n_samples=settings["n_samples"], mean=mean, seed=seed).ask()
+        xs = phytofit.optimize.CrossEntropy(space, n_samples=settings["n_samples"], mean=mean, seed=seed).ask()
         errors = objective(xs, 1)
         if errors.min() < least:
             best, least = xs[np.argmin(errors)], errors.min()
@@ -103,7 +109,7 @@ def evolution(points: np.ndarray, settings: dict[str, int]) -> tuple[list[phytof
     """Differential evolution (SciPy's), its first generation drawn from the prior."""
     space, mean, objective = problem_of(points, settings["n_points"])
     box = box_of(space, mean)
-    first = phytofit.CrossEntropy(space, n_samples=settings["n_samples"], mean=mean).ask()
+    first = phytofit.optimize.CrossEntropy(space, n_samples=settings["n_samples"], mean=mean).ask()
     found = differential_evolution(
         lambda columns: objective(np.ascontiguousarray(columns.T)),
         box,

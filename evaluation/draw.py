@@ -9,6 +9,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 
 import phytofit
+import phytofit.models
 
 BLACK = "#222222"
 DPI = 130
@@ -19,7 +20,7 @@ def save(figure: Figure, path: Path) -> None:
     figure.savefig(path, dpi=DPI, metadata={"Software": None})
 
 
-def side_of(organs: Sequence[phytofit.Organ]) -> np.ndarray:
+def side_of(organs: Sequence[phytofit.models.Organ]) -> np.ndarray:
     """Rotation (3, 3) that shows a phytomer from its side, somewhat from above so that its blade is seen: the stem's
     axis upwards, the leaf to the right."""
     stem, leaf = organs
@@ -32,9 +33,9 @@ def side_of(organs: Sequence[phytofit.Organ]) -> np.ndarray:
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]) @ np.stack([away, up, np.cross(away, up)])
 
 
-def outline(ax: Axes, organs: Sequence[phytofit.Organ], view: np.ndarray, color: str) -> None:
+def outline(ax: Axes, organs: Sequence[phytofit.models.Organ], view: np.ndarray, color: str) -> None:
     """The organs' surfaces as seen along the third axis of the view, half transparent, and the midrib."""
-    surface = phytofit.mesh(organs, n_around=16)
+    surface = phytofit.models.mesh(organs, n_around=16)
     triangles = (np.asarray(surface.vertices) @ view.T)[np.asarray(surface.faces)][:, :, :2]
     ax.add_collection(PolyCollection(list(triangles), facecolor=color, edgecolor="none", alpha=0.3, zorder=2))
     midrib = organs[1].axis @ view.T

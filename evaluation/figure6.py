@@ -8,6 +8,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 import phytofit
+import phytofit.distances
+import phytofit.fitting
+import phytofit.models
+import phytofit.objectives
+import phytofit.optimize
+import phytofit.preparation
 from evaluation.draw import BLACK, outline, save, side_of
 from evaluation.jobs import run_all
 from evaluation.settings import COLORS, NAMES, PAPERS, SPECIES, Budget, clouds, read
@@ -29,19 +35,19 @@ def search(path: Path | None, settings: dict[str, int]) -> dict[str, Any]:
     made = phytofit.simulate(stem_above="equal", seed=3)
     cloud = phytofit.from_points(made.points, "cm") if path is None else read(path)
     species = PAPERS
-    found = phytofit.prepare(cloud, species, n_points=settings["n_points"])
-    objective = phytofit.PaperObjective(
+    found = phytofit.preparation.prepare(cloud, species, n_points=settings["n_points"])
+    objective = phytofit.objectives.PaperObjective(
         species.model,
-        phytofit.Reference.of(found.points),
+        phytofit.distances.Reference.of(found.points),
         starts=[start.pose for start in found.starts],
         n_points=settings["n_points"],
     )
-    run = phytofit.minimise(
-        phytofit.CrossEntropy(
+    run = phytofit.objectives.minimise(
+        phytofit.optimize.CrossEntropy(
             species.space,
             n_samples=settings["n_samples"],
             n_generations=settings["n_generations"],
-            mean=phytofit.mean_at(found.starts[0], species),
+            mean=phytofit.fitting.mean_at(found.starts[0], species),
         ),
         objective,
     )
@@ -49,7 +55,7 @@ def search(path: Path | None, settings: dict[str, int]) -> dict[str, Any]:
     for generation in run.history:
         registration, error = objective.register(generation.mean)
         organs = [organ.row(0) for organ in species.model.organs(generation.mean)]
-        models.append((phytofit.move(organs, registration.T_target_source), error))
+        models.append((phytofit.models.move(organs, registration.T_target_source), error))
     default = phytofit.fit(cloud, threads=1)
     return {
         "points": found.points,

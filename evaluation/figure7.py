@@ -8,6 +8,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 import phytofit
+import phytofit.simulation
 from benchmarks import model_free
 from evaluation.draw import BLACK, faceted, outline, save, side_of
 from evaluation.jobs import console, run_all
@@ -56,10 +57,10 @@ def corrupted(path: Path, how: str, number: int) -> tuple[np.ndarray, np.ndarray
     points = read(path).points
     random = np.random.default_rng(number)
     if how == "noise":
-        return phytofit.add_noise(points, NOISE_CM, random), None
+        return phytofit.simulation.add_noise(points, NOISE_CM, random), None
     if how == "sphere":
         center = points[np.random.default_rng(number).integers(len(points))]  # the first that `occlude` draws
-        return points[phytofit.occlude(points, SPHERE_CM, random)], center
+        return points[phytofit.simulation.occlude(points, SPHERE_CM, random)], center
     return points, None
 
 

@@ -10,6 +10,12 @@ import numpy as np
 import pandas as pd
 
 import phytofit
+import phytofit.distances
+import phytofit.fitting
+import phytofit.models
+import phytofit.objectives
+import phytofit.optimize
+import phytofit.preparation
 from benchmarks import peers
 from evaluation.jobs import run_all
 from evaluation.settings import PAPERS, Budget
@@ -51,9 +57,9 @@ def seconds(n_samples: int, n_points: int, n_generations: int, n_candidates: int
     many candidates, each with 50 rounds of ICP and the Hausdorff distance."""
     species = PAPERS
     cloud = phytofit.from_points(phytofit.simulate(n_points=n_points, seed=1).points, "cm")
-    found = phytofit.prepare(cloud, species, n_points=n_points)
+    found = phytofit.preparation.prepare(cloud, species, n_points=n_points)
     starts = [start.pose for start in found.starts]
-    mean = phytofit.mean_at(found.starts[0], species)
+    mean = phytofit.fitting.mean_at(found.starts[0], species)
     row: dict[str, float] = {
         "samples": n_samples,
         "points": n_points,
@@ -61,21 +67,27 @@ def seconds(n_samples: int, n_points: int, n_generations: int, n_candidates: int
     }
     for threads in (CORES, 1):
         with ThreadPoolExecutor(threads) as executor:
-            search = phytofit.CrossEntropy(species.space, n_samples=n_samples, n_generations=n_generations, mean=mean)
-            objective = phytofit.PaperObjective(
-                species.model, phytofit.Reference.of(found.points), starts=starts, n_points=n_points, executor=executor
+            search = phytofit.optimize.CrossEntropy(
+                species.space, n_samples=n_samples, n_generations=n_generations, mean=mean
             )
-            phytofit.minimise(
-                phytofit.CrossEntropy(species.space, n_samples=20, n_generations=1, mean=mean), objective
+            objective = phytofit.objectives.PaperObjective(
+                species.model,
+                phytofit.distances.Reference.of(found.points),
+                starts=starts,
+                n_points=n_points,
+                executor=executor,
+            )
+            phytofit.objectives.minimise(
+                phytofit.optimize.CrossEntropy(species.space, n_samples=20, n_generations=1, mean=mean), objective
             )  # kernels compiled
             began = time.perf_counter()
-            phytofit.minimise(search, objective)
+            phytofit.objectives.minimise(search, objective)
             row["all threads" if threads == CORES and "all threads" not in row else "one thread"] = (
                 time.perf_counter() - began
             ) / n_generations
     row.setdefault("one thread", row["all threads"])
     organs = species.model.organs(search.ask()[:n_candidates])
-    population = phytofit.SurfaceSampler(n_points, seed=0).population(organs)
+    population = phytofit.models.SurfaceSampler(n_points, seed=0).population(organs)
     for make_peer in (peers.small_gicp_peer, peers.open3d_peer, peers.scipy_peer):
         try:
             peer = make_peer(found.points)

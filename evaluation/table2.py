@@ -7,12 +7,14 @@ import numpy as np
 import pandas as pd
 
 import phytofit
+import phytofit.models
+import phytofit.results
 from benchmarks import model_free
 from evaluation.jobs import run_all
 from evaluation.settings import NAMES, Budget, clouds, read
 from evaluation.tables import interval_of_r, write_markdown, write_table
 
-PARAMETERS = phytofit.Phytomer.PARAMETERS[:6]  # of Eq. (1)
+PARAMETERS = phytofit.models.Phytomer.PARAMETERS[:6]  # of Eq. (1)
 UNIT = {name: "°" if "angle" in name else " cm" for name in PARAMETERS}
 FIRST_SEED = 100_000
 TRAITS = ("leaf_length", "leaf_angle", "leaf_width", "stem_diameter")
@@ -159,4 +161,4 @@ def real(budget: Budget, out: Path) -> None:
 
 def real_fit(method: str, path: Path, settings: dict[str, int]) -> pd.DataFrame:
     result = phytofit.fit(read(path), method=method, threads=1, **settings)
-    return phytofit.trait_table(path.stem, result.traits)
+    return phytofit.results.trait_table(path.stem, result.traits)

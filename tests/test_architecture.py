@@ -46,6 +46,14 @@ DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}
 RESULTS = ("fitted.py", "segmentation/whole.py", "reconstruct/depth.py")
 SHOWS_ITSELF = {(file, part) for file in RESULTS for part in ("plots", "results")}
 
+# What a user needs; the rest is imported from its module.
+PUBLIC = """
+CAMERAS Agreement Camera CloudError Comparison Fit InputError NoPhytomerError NoStemError OutputError PhytofitError
+PlantRun PointCloud Reconstruction Segmentation SegmentedLeaf SettingError SimulatedPhytomer Species SpeciesError Status
+Trait UnitError agreement compare fit from_points load_camera load_species measure read_cloud read_measures read_results
+recipe reconstruct run save_fit save_reconstruction save_segmentation segment separate_plants simulate write_cloud
+"""
+
 FILES = sorted(SOURCE.rglob("*.py"))
 IDS = [str(path.relative_to(SOURCE)) for path in FILES]
 
@@ -171,6 +179,7 @@ def is_sorted(names):
 
 def test_public_names():
     names = phytofit.__all__
+    assert set(names) == set(PUBLIC.split())
     assert len(names) == len(set(names))
     assert is_sorted(names)
     for name in names:

@@ -1,6 +1,7 @@
 """The evaluation runs, goes on where it was stopped, and its tables stand on the pages as they were written."""
 
 import ast
+import importlib
 import os
 import re
 import signal
@@ -73,18 +74,18 @@ def test_another_state_of_the_code_keeps_apart(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "evaluation").glob("*.py")), ids=lambda path: path.name)
-def test_only_public_names_of_phytofit_are_used(path):
+def test_only_names_that_phytofit_offers_are_used(path):
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    froms = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
-    modules = [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
-    modules += [alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names]
-    assert not [name for name in modules if name.startswith("phytofit.") or (name == "phytofit" and name in froms)]
-    used = {
-        n.attr
-        for n in ast.walk(tree)
-        if isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name) and n.value.id == "phytofit"
-    }
-    assert used - {"__file__"} <= set(phytofit.__all__)
+    froms = [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
+    assert not [name for name in froms if name.split(".")[0] == "phytofit"]
+    imports = [alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names]
+    used = {ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    for name in (name for name in used if re.fullmatch(r"phytofit(\.\w+)+", name)):
+        first, *rest = name.split(".")[1:]
+        if f"phytofit.{first}" in imports:
+            assert not rest or rest[0] in importlib.import_module(f"phytofit.{first}").__all__, name
+        else:
+            assert first in {*phytofit.__all__, "__file__"}, name
 
 
 @pytest.mark.parametrize("arguments", [["--quick"], ["nothing", "--out", "x"]])

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import phytofit
+import phytofit.models
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -118,5 +119,5 @@ def test_the_species_of_the_documentation_is_one(tmp_path):
     (tmp_path / "maize.toml").write_text(whole, encoding="utf-8")
     species = phytofit.load_species(tmp_path / "maize.toml")
     assert species.name == "maize"
-    assert species.space.names == phytofit.Phytomer.PARAMETERS[:7]
+    assert species.space.names == phytofit.models.Phytomer.PARAMETERS[:7]
     assert len(phytofit.simulate(species).points) == 5000

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 import phytofit
+import phytofit.models
 from phytofit import CloudError, NoPhytomerError, SettingError, SpeciesError, Status, UnitError, preparation
 
 SMALL = {"method": "paper", "n_samples": 120, "n_points": 800, "n_generations": 5, "threads": 2}
@@ -48,7 +49,7 @@ def test_recovers_a_simulated_phytomer(made, result):
 
 def test_model_lies_on_the_points(made, result):
     """The error is the Hausdorff distance of the fitted organs to the cloud, measured anew and independently."""
-    points, _ = phytofit.SurfaceSampler(SMALL["n_points"], 0).draw(result.organs)
+    points, _ = phytofit.models.SurfaceSampler(SMALL["n_points"], 0).draw(result.organs)
     to_cloud = cKDTree(result.reference).query(points)[0]
     from_cloud = cKDTree(points).query(result.reference)[0]
     assert max(to_cloud.max(), from_cloud.max()) == pytest.approx(result.error, abs=1e-3)
@@ -128,10 +129,10 @@ def test_a_straight_level_leaf_is_flagged_since_up_and_down_look_alike(method):
 
 
 def test_the_upside_down_twin_has_the_same_organs():
-    model = phytofit.Phytomer()
+    model = phytofit.models.Phytomer()
     x = np.array([3.0, 12.0, 70.0, 50.0, 5.0, 4.0, 9.0])
     turn, offset, pose = model.upside_down(x)
-    twin = phytofit.move([o.row(0) for o in model.organs(turn @ x + offset)], pose)
+    twin = phytofit.models.move([o.row(0) for o in model.organs(turn @ x + offset)], pose)
     for a, b in zip(twin, [o.row(0) for o in model.organs(x)], strict=True):
         nodes = a.axis[::-1] if a.kind == "stem" else a.axis
         np.testing.assert_allclose(nodes, b.axis, atol=1e-9)

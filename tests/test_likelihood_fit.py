@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 
 import phytofit
+import phytofit.models
+import phytofit.parameters
+import phytofit.simulation
 from phytofit import Status
 from phytofit.fitted import beside_its_rival
 
@@ -120,8 +123,8 @@ def test_a_leaf_that_no_paper_draws_is_fitted_with_more_parameters():
     }
     real = phytofit.simulate(fixed=GENTLE | shape, n_points=N_POINTS, noise_cm=0.3, seed=5)
     found = phytofit.fit(real.points, "cm", up=real.pose[:3, 2], threads=2)
-    assert len(found.x) == len(phytofit.Phytomer.PARAMETERS)
-    names = phytofit.Phytomer.PARAMETERS
+    assert len(found.x) == len(phytofit.models.Phytomer.PARAMETERS)
+    names = phytofit.models.Phytomer.PARAMETERS
     for name, value in shape.items():
         i = names.index(name)
         assert abs(abs(found.x[i]) - abs(value)) < WITHIN_STD * np.sqrt(found.covariance[i, i]), name
@@ -133,7 +136,7 @@ def test_a_leaf_that_no_paper_draws_is_fitted_with_more_parameters():
 
 def test_outliers_are_told_apart(made, result):
     random = np.random.default_rng(0)
-    stray = phytofit.add_outliers(made.points, 0.3, random)
+    stray = phytofit.simulation.add_outliers(made.points, 0.3, random)
     among = phytofit.fit(np.concatenate([made.points, stray]), "cm", threads=2)
     assert among.estimate.share[2] == pytest.approx(0.3 / 1.3, abs=0.04)
     assert flagged(among, "does not explain 2")
@@ -225,7 +228,7 @@ def bounded(name, **bounds):
     narrow = [dataclasses.replace(p, **bounds) if j == i else p for j, p in enumerate(species.space.parameters)]
     ranges = species.ranges.copy()
     ranges[i] = np.clip(ranges[i], narrow[i].lower, narrow[i].upper)
-    return dataclasses.replace(species, space=phytofit.ParameterSpace(narrow), ranges=ranges)
+    return dataclasses.replace(species, space=phytofit.parameters.ParameterSpace(narrow), ranges=ranges)
 
 
 def test_a_parameter_at_its_bound_is_flagged(made):
@@ -268,7 +271,7 @@ def no_phytomers():
 @pytest.mark.parametrize("shape", no_phytomers())
 def test_a_cloud_with_no_phytomer_is_refused(shape):
     """More of them, and what is said, in test_no_phytomer.py."""
-    points = phytofit.add_noise(no_phytomers()[shape], 0.5, np.random.default_rng(1))
+    points = phytofit.simulation.add_noise(no_phytomers()[shape], 0.5, np.random.default_rng(1))
     with pytest.raises(phytofit.NoPhytomerError):
         phytofit.fit(points, "cm", threads=2)
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import phytofit
+import phytofit.simulation
 from phytofit.fitted import MUCH_ELSEWHERE, remarked
 from phytofit.flags import UNUSABLE
 from phytofit.unexplained import on_something_else
@@ -90,7 +91,9 @@ def test_what_is_no_phytomer_is_refused_with_a_plain_sentence(made, kind):
 def test_a_phytomer_among_outliers_and_without_a_piece_is_measured(made):
     """Of the points a third is of no organ; 6 cm of the leaf's middle are missing."""
     whole = np.linalg.norm(made.points - made.organs[1].axis[12], axis=1) > 3.0
-    points = np.concatenate([made.points[whole], phytofit.add_outliers(made.points, 0.5, np.random.default_rng(0))])
+    points = np.concatenate(
+        [made.points[whole], phytofit.simulation.add_outliers(made.points, 0.5, np.random.default_rng(0))]
+    )
     found = phytofit.fit(points, "cm", threads=2)
     assert found.estimate.sighting.elsewhere < 0.25 * MUCH_ELSEWHERE
     assert not any(flag.startswith(UNUSABLE) for flag in found.flags)

@@ -15,6 +15,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.colors import to_rgb
 
 import phytofit
+import phytofit.plots
 from phytofit.plots import plot_plant, plot_plants
 from phytofit.plots.page import digits, fitting, folded, in_short, interval, number, width_in
 from phytofit.plots.phytomer import MEASURE
@@ -101,11 +102,11 @@ SHAPES = {
 def test_a_fit_of_any_shape_has_its_picture(bent, shape, points, flags, title, scale):
     x = np.array([shape.get(name, value) for name, value in zip(bent.species.space.names, bent.x, strict=True)])
     odd = replace(bent, x=x, reference=points, flags=tuple(flags))
-    rendered(phytofit.plot_fit(odd if scale is None else replace(odd, relative=True, scale=scale), title))
+    rendered(phytofit.plots.plot_fit(odd if scale is None else replace(odd, relative=True, scale=scale), title))
 
 
 def test_what_is_drawn_as_measured_is_to_scale(fitted):
-    figure = phytofit.plot_fit(fitted, "leaf")
+    figure = phytofit.plots.plot_fit(fitted, "leaf")
     side = figure.axes[0]
     assert np.allclose(side.get_position().size * figure.get_size_inches(), [side.get_xlim()[1], side.get_ylim()[1]])
     bar = next(line for line in side.lines if line.get_linewidth() == 2.0)
@@ -124,11 +125,11 @@ def test_what_is_drawn_as_measured_is_to_scale(fitted):
 
 
 def test_the_same_fit_gives_the_same_bytes(fitted):
-    assert len({rendered(phytofit.plot_fit(fitted, HOSTILE)) for _ in range(2)}) == 1
+    assert len({rendered(phytofit.plots.plot_fit(fitted, HOSTILE)) for _ in range(2)}) == 1
 
 
 def test_the_search_has_its_picture(fitted):
-    rendered(phytofit.plot_convergence(fitted))
+    rendered(phytofit.plots.plot_convergence(fitted))
 
 
 def plant_of(seed, n_leaves, n_points, *, size=30.0, unit="cm", up=None):
@@ -178,7 +179,7 @@ def traits_of(plant, *, number=1):
 )
 def test_a_plant_of_any_shape_has_its_pictures(seed, n_leaves, n_points, size, unit, title):
     plant = plant_of(seed, n_leaves, n_points, size=size, unit=unit)
-    for figure in (phytofit.plot_segmentation(plant, title), plot_plant(plant, traits_of(plant), title)):
+    for figure in (phytofit.plots.plot_segmentation(plant, title), plot_plant(plant, traits_of(plant), title)):
         rendered(figure)
         for ax in figure.axes[:2]:
             assert {text.get_text() for text in ax.texts} >= {str(leaf.rank) for leaf in plant.leaves}
@@ -208,7 +209,7 @@ def test_a_reconstruction_has_its_picture(n_points, n_views):
         flags=(HOSTILE,),
         settings={},
     )
-    figure = phytofit.plot_reconstruction(result, HOSTILE)
+    figure = phytofit.plots.plot_reconstruction(result, HOSTILE)
     rendered(figure)
     assert any("left out: " in word for word in words_of(figure))
     assert {len(ax.collections[0].get_offsets()) for ax in figure.axes} == {n_points}
@@ -231,7 +232,7 @@ def test_a_plant_s_table_says_what_was_measured_and_what_is_wrong():
 
 def test_a_stated_up_is_up():
     stem = plant_of(3, 2, 9, up=[0.0, 1.0, 0.0]).stem_path
-    figure = phytofit.plot_segmentation(plant_of(3, 2, 9, up=[0.0, 1.0, 0.0]))
+    figure = phytofit.plots.plot_segmentation(plant_of(3, 2, 9, up=[0.0, 1.0, 0.0]))
     for ax in figure.axes[:2]:
         axis = next(line.get_xydata() for line in ax.lines if line.get_color() == "white")
         heights = (axis[:, 1] - axis[0, 1]) / (axis[-1, 1] - axis[0, 1])

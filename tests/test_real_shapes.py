@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import phytofit
+import phytofit.models
+import phytofit.simulation
 from phytofit import posterior
 from phytofit.beginnings import along_points, longer_leaf, longer_stem, lower_insertion, turned_blade
 from phytofit.dependence import Bell, Dependence
@@ -16,7 +18,7 @@ GENTLE = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diam
 REAL = {"leaf_base_width": 0.5, "leaf_widest_at": 0.4, "leaf_bow": 10.0}
 WITHIN_STD = 4.0  # standard errors: one in 16,000 is further off
 SPECIES = phytofit.load_species()
-NAMES = phytofit.Phytomer.PARAMETERS
+NAMES = phytofit.models.Phytomer.PARAMETERS
 
 
 def grown(seed=5, n_points=2500, noise_cm=0.3, **fixed):
@@ -121,10 +123,10 @@ def rising(seed, along_cm, length=50.0, radius=1.2, noise_cm=0.3):
     axis = np.vstack([np.zeros(3), np.cumsum(step, axis=0)]) + np.array([radius, 0.0, 15.0])
     half = np.interp(s / length, [0.0, 0.3, 0.66, 1.0], [1.25, 2.5, 1.75, 0.0])
     tube, level = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 25.0]]), np.array([0.0, 1.0, 0.0])
-    stem = phytofit.Organ("stem", tube, frames_along(tube, level), np.full(2, radius))
-    leaf = phytofit.Organ("leaf", axis, frames_along(axis, level), half)
-    points = phytofit.SurfaceSampler(4000, seed, even=False).draw([stem, leaf])[0]
-    return phytofit.add_noise(points, noise_cm, np.random.default_rng(seed)), length
+    stem = phytofit.models.Organ("stem", tube, frames_along(tube, level), np.full(2, radius))
+    leaf = phytofit.models.Organ("leaf", axis, frames_along(axis, level), half)
+    points = phytofit.models.SurfaceSampler(4000, seed, even=False).draw([stem, leaf])[0]
+    return phytofit.simulation.add_noise(points, noise_cm, np.random.default_rng(seed)), length
 
 
 @pytest.mark.parametrize("shape", [{"leaf_base_bend": 30.0}, {"leaf_rotate_angle": 4.5, "leaf_bow": -8.0}])
@@ -214,7 +216,7 @@ def test_points_beyond_the_tip_are_flagged_and_open_the_length():
 
 def test_outliers_all_over_are_not_points_beyond_the_tip():
     made = grown()
-    stray = phytofit.add_outliers(made.points, 0.15, np.random.default_rng(2))
+    stray = phytofit.simulation.add_outliers(made.points, 0.15, np.random.default_rng(2))
     result = fitted(made, np.concatenate([made.points, stray]))
     assert result.estimate.sighting.beyond == 0.0
 
@@ -386,11 +388,11 @@ def wavy(seed=1, n_points=4000, radius=1.2, noise_cm=0.25, along_deg=8.0, ragged
     half *= 1.0 + ragged * np.sin(2.0 * np.pi * s / 11.0)
     tube, level = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 25.0]]), np.array([0.0, 1.0, 0.0])
     organs = (
-        phytofit.Organ("stem", tube, frames_along(tube, level), np.full(2, radius)),
-        phytofit.Organ("leaf", axis, frames_along(axis, level), half),
+        phytofit.models.Organ("stem", tube, frames_along(tube, level), np.full(2, radius)),
+        phytofit.models.Organ("leaf", axis, frames_along(axis, level), half),
     )
-    points = phytofit.SurfaceSampler(n_points, seed, even=False).draw(organs)[0]
-    return phytofit.add_noise(points, noise_cm, np.random.default_rng(seed)), organs
+    points = phytofit.models.SurfaceSampler(n_points, seed, even=False).draw(organs)[0]
+    return phytofit.simulation.add_noise(points, noise_cm, np.random.default_rng(seed)), organs
 
 
 @pytest.mark.parametrize("on_stem", [0.0, 0.6])

@@ -13,8 +13,9 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from phytofit import from_points, load_species, mesh, simulate
+from phytofit import from_points, load_species, simulate
 from phytofit.errors import OutputError, SettingError
+from phytofit.models import mesh
 from phytofit.results import (
     FolderTable,
     read_table,

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import phytofit
-from phytofit import Phytomer, SettingError
+import phytofit.models
+from phytofit import SettingError
 from phytofit.cli import app
+from phytofit.models import Phytomer
 
 SMALL = {"method": "paper", "n_samples": 120, "n_points": 800, "n_generations": 5, "threads": 2}
 GENTLE = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 12.0}
@@ -47,7 +49,7 @@ def test_a_leaf_in_the_middle_of_its_stem_is_the_same_upside_down(x):
     model = Phytomer(stem_above=1.0)
     turn, offset, pose = model.upside_down(np.array(x))
     twin = turn @ x + offset
-    there = phytofit.move([organ.row(0) for organ in model.organs(twin)], pose)
+    there = phytofit.models.move([organ.row(0) for organ in model.organs(twin)], pose)
     stem, leaf = (organ.row(0) for organ in model.organs(x))
     np.testing.assert_allclose(there[0].axis[::-1], stem.axis, atol=1e-9)
     np.testing.assert_allclose(there[1].axis, leaf.axis, atol=1e-9)

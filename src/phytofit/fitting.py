@@ -72,7 +72,7 @@ def fit(
     n_samples, n_generations : of the cross-entropy search: 500 candidates in each of 10 generations for "paper",
         60 in each of 4 for "likelihood", which is refined afterwards
     n_points : to which the cloud is thinned: 10,000 for "likelihood"; 5,000 for "paper", and also of each candidate
-    elite_fraction, covariance_noise : see :class:`phytofit.CrossEntropy`
+    elite_fraction, covariance_noise : see :class:`phytofit.optimize.CrossEntropy`
     random_start : start the search from means drawn from the prior (as in Fig. 7d), not from the prior's and, for
         the stem's diameter and lengths, from the start pose
     stem_above : of the stem above the leaf: "equal", as long as below it; "none"; or "free", a parameter of its own.
