@@ -79,3 +79,16 @@ def test_a_process_that_is_killed_leaves_what_the_next_repairs(world, folder, co
     there = files_in(out)
     assert not [name for name in there if is_hidden(name)]
     assert {name for name in notes if name in there or (out / name).parent.exists()} <= set(there)
+
+
+@pytest.mark.long
+def test_a_full_disk_behind_standard_output_is_one_line(tmp_path):
+    arguments = ["simulate", "--points", "150", "--out", str(tmp_path)]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "phytofit", *arguments], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: standard output: No space left")
+    assert len(done.stderr.splitlines()) == 1
+    assert (tmp_path / "truth.csv").is_file()

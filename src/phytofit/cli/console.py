@@ -220,6 +220,8 @@ def _ending() -> Iterator[None]:
 def unforeseen(error: Exception) -> str:
     """What to say of a fault of phytofit's own; its details are logged."""
     DETAILS.error("where it arose:", exc_info=error)
+    if isinstance(error, OSError) and error.strerror:  # of what was given or is written to, not of phytofit
+        return f"{error.filename or 'standard output'}: {error.strerror}; choose another file or folder, or make room"
     logs = [handler.baseFilename for handler in LOG.handlers if isinstance(handler, logging.FileHandler)]
     ours = [log for log in logs if Path(log).name == "phytofit.log"]
     where = f"details are in {ours[0]}" if ours else "--verbose shows details"
