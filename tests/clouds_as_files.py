@@ -102,6 +102,9 @@ TEXT = {
     "names with units": Dialect(".csv", lambda p: text(p, ",", head='"X [mm]","Y [mm]","Z [mm]"\n'), unit="mm"),
     "names with units, blanks": Dialect(".txt", lambda p: text(p, head="X (m) Y (m) Z (m)\n"), unit="m"),
     "names with units, underscores": Dialect(".csv", lambda p: text(p, ",", head="x_cm,y_cm,z_cm\n"), unit="cm"),
+    "units under the names": Dialect(
+        ".csv", lambda p: text(p, ";", head="X;Y;Z\n[mm];[mm];[mm]\n", number=comma), unit="mm"
+    ),
     "ParaView": Dialect(".csv", lambda p: text(p, ",", head='"Points:0","Points:1","Points:2"\n')),
     "names that are quoted": Dialect(".txt", lambda p: text(p, head='"x" "y" "z" "plant id"\n', more=' "A 7"')),
     "a title": Dialect(".csv", lambda p: text(p, ",", head="Leaf of maize\nX,Y,Z\n")),
@@ -228,6 +231,7 @@ BINARY = {
     "PLY, mesh": Dialect(".ply", lambda p: mesh_bytes(p, file_type="ply"), SINGLE * 30),
     "PCD, text": Dialect(".pcd", ascii_pcd),
     "PCD, text, tabs, CRLF": Dialect(".pcd", lambda p: ascii_pcd(p, separator="\t", end="\r\n")),
+    "PCD, text, no POINTS": Dialect(".pcd", lambda p: ascii_pcd(p).replace(b"POINTS %d\n" % len(p), b"")),
     "PCD, binary": Dialect(".pcd", lambda p: pcd(p, "binary")),
     "PCD, compressed": Dialect(".pcd", lambda p: pcd(p, "binary_compressed")),
     "LAS 1.2": Dialect(".las", las, 1e-5, "m"),

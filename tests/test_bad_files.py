@@ -112,6 +112,16 @@ ERRORS = [
         "a.las: its LAS 1.4 header declares 120 points, and 77 in",
     ),
     ("a.las", patched(LAS, "<d", 139, np.nan), "a.las: its LAS header has the scales and offsets 1e-05, nan, 1e-05,"),
+    (
+        "a.las",
+        patched(LAS, "<B", 104, 11),
+        "a.las: its LAS header has version 1.2 and point format 11, expected 1.0 to",
+    ),
+    (
+        "a.las",
+        patched(LAS, "<B", 25, 5),
+        "a.las: its LAS header has version 1.5 and point format 3, expected 1.0 to 1.4",
+    ),
     # E57 and OBJ
     (
         "a.e57",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phytofit.cloud.copies import places_of, unrounded
+from phytofit.cloud.copies import is_single, places_of, unrounded
 from phytofit.cloud.thinning import size_cm
 from phytofit.cloud.units import SCALE_CM, checked_unit
 from phytofit.errors import CloudError
@@ -188,10 +188,10 @@ def _finite(called: str, points: ArrayLike) -> tuple[NDArray[np.float64], NDArra
 def _few_digits(called: str, xyz: NDArray[np.float64], step: NDArray[np.float64], unit: str) -> str:
     """A note on coordinates in coarse steps; CloudError if they leave too few places."""
     n_places = len(np.unique(xyz, axis=0))
-    is_single = bool((xyz.astype(np.float32) == xyz).all()) and np.abs(xyz).max() > FAR_STEPS * step.max()
+    is_map = is_single(xyz) and np.abs(xyz).max() > FAR_STEPS * step.max()
     steps = f"coordinates are in steps of {step.max():.3g} {'' if unit == 'none' else unit}".strip()
-    cause = " (map coordinates in single precision)" if is_single else ""
-    advice = "subtract an offset before the export, or write doubles" if is_single else "export it with more digits"
+    cause = " (map coordinates in single precision)" if is_map else ""
+    advice = "subtract an offset before the export, or write doubles" if is_map else "export it with more digits"
     if n_places < MIN_POINTS or step.max() > TOO_COARSE * size_cm(xyz):
         raise CloudError(f"{called}: {steps}{cause}, which leaves {n_places} places for {len(xyz)} points; {advice}")
     return f"{steps}{cause}: digits are missing; {advice}"

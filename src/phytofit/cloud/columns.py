@@ -32,6 +32,7 @@ class _Head(NamedTuple):
 
     names: str | None  # the line that names x, y and z
     is_comment: bool  # whether that line is one
+    unit: str | None  # that a row of units under it states
     counts: list[int]  # of points, as PTS and CloudCompare write them
     title: str | None  # the last line that is none of these
     start: int  # of the rows, in the text
@@ -65,7 +66,7 @@ def read(data: bytes, wanted: Collection[str]) -> Table:
     return Table(
         [(name, values[i]) for i, name in enumerate(names) if i in values],
         names,
-        unit=(unit[1] or unit[2]).lower() if unit else None,
+        unit=(unit[1] or unit[2]).lower() if unit else head.unit,
         notes=notes,
     )
 
@@ -86,7 +87,7 @@ def _check_columns(n_columns: int, n_most: int, head: _Head) -> None:
 
 
 def _head(text: str) -> _Head:
-    names, is_comment, title, counts = None, True, None, list[int]()
+    names, is_comment, unit, title, counts = None, True, None, None, list[int]()
     for line in LINE.finditer(text):
         content = line[0].strip()
         if COMMENT.match(content):
@@ -94,17 +95,25 @@ def _head(text: str) -> _Head:
             names = content if is_comment and _names_points(content) else names
         elif SEPARATOR_LINE.fullmatch(content):
             pass
+        elif not is_comment and (units := _units(content)):
+            unit = units[0]
         elif count := COUNT.fullmatch(content):
             counts.append(int(count[1]))
         elif not is_comment or all(
             is_number(word) for word in re.split(r"[;,\s]+", content.replace('"', ""), maxsplit=3)[:3]
         ):
-            return _Head(names, is_comment, counts, title, line.start())
+            return _Head(names, is_comment, unit, counts, title, line.start())
         elif _names_points(content):
             names, is_comment = content, False
         else:
             title = content
-    return _Head(names, is_comment, counts, title, len(text))
+    return _Head(names, is_comment, unit, counts, title, len(text))
+
+
+def _units(line: str) -> list[str]:
+    """The units in a line of nothing else."""
+    words = [word.strip("\"'[]()").lower() for word in re.split(r"[;,\s]+", line)]
+    return [word for word in words if word] if {*words} <= {"mm", "cm", "m", ""} else []
 
 
 def _names_points(line: str) -> bool:

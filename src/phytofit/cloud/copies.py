@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from phytofit.cloud.thinning import size_cm
 
-__all__ = ["Places", "places_of", "unrounded"]
+__all__ = ["Places", "is_single", "places_of", "unrounded"]
 
 FloatArray = NDArray[np.float64]
 MANY = 10  # times as many points as any place near it has, at one place: no surface was measured so
@@ -58,6 +58,12 @@ def unrounded(points: FloatArray, step: FloatArray) -> FloatArray:
     return moved
 
 
+def is_single(values: FloatArray) -> bool:
+    """Whether single precision holds all these numbers exactly."""
+    with np.errstate(over="ignore"):
+        return bool((values.astype(np.float32) == values).all())
+
+
 def _distinct(points: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """First point of each place, place of each point, and how many each place has; places in the first ones' order."""
     order = np.lexsort((np.arange(len(points)), *points.T))
@@ -102,7 +108,7 @@ def _step(values: FloatArray) -> float:
     """The step of which all differences of coordinates (n,) are multiples, in the precision they have; 0 if none."""
     largest = np.abs(values).max()
     spacings = [float(np.spacing(largest))]
-    if (values.astype(np.float32) == values).all():
+    if is_single(values):
         spacings.append(float(np.spacing(np.float32(largest))))
     all_gaps = np.diff(np.unique(values))
     for spacing in spacings:

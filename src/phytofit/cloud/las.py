@@ -15,6 +15,7 @@ from phytofit.cloud.table import XYZ, FileError, Table, keys_of, quoted
 __all__ = ["read"]
 
 logging.getLogger("laspy").addHandler(logging.NullHandler())  # or it prints what is raised here anyway
+POINT_FORMAT, LAST_POINT_FORMAT = 0x3F, 10  # bits of its byte that number it; the others mark LAZ
 VERSION_OF_LONG_COUNT = (1, 4)  # since which the number of points has a field of 64 bits beside that of 32
 
 
@@ -38,6 +39,9 @@ def _check_header(header: bytes, n_bytes: int) -> None:
         struct.unpack_from(kind, header, at)[0]
         for kind, at in (("<I", 96), ("<I", 100), ("<H", 105), ("<I", 107), ("<I", 243), ("<Q", 247))
     )
+    if not "1.0" <= version <= "1.4" or header[104] & POINT_FORMAT > LAST_POINT_FORMAT:
+        found = f"version {version} and point format {header[104] & POINT_FORMAT}"
+        raise FileError(f"its LAS header has {found}, expected 1.0 to 1.4 and 0 to 10; export it again as LAS 1.2")
     if 54 * n_vlrs + (60 * n_evlrs if is_new else 0) > n_bytes:
         raise FileError(f"damaged: its LAS header declares {n_vlrs} more headers; copy it again")
     count = long_count if is_new else old_count

@@ -45,6 +45,8 @@ def read(data: bytes, wanted: Collection[str]) -> Table:
 def _header(text: bytes, encoding: str) -> _Header:
     lines = [line.decode("latin-1").split() for line in text.splitlines()]
     found = {words[0]: words[1:] for words in lines if words}
+    if "POINTS" not in found and {"WIDTH", "HEIGHT"} <= {key for key, values in found.items() if values}:
+        found["POINTS"] = [str(int(found["WIDTH"][0]) * int(found["HEIGHT"][0]))]
     if not {"FIELDS", "SIZE", "TYPE", "POINTS"} <= {key for key, values in found.items() if values}:
         raise FileError(
             f"its PCD header holds {listed(found)}, expected FIELDS, SIZE, TYPE and POINTS; export it again"
