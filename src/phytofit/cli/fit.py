@@ -54,7 +54,7 @@ def fit_command(
         list[str],
         typer.Argument(
             metavar="CLOUDS",
-            help="Point clouds (PLY, PCD, LAS/LAZ, XYZ, TXT, CSV, PTS, ASC), folders of them, or patterns.",
+            help="Point clouds (PLY, PCD, LAS/LAZ, E57, OBJ, XYZ, TXT, CSV, PTS, ASC), folders of them, or patterns.",
             show_default=False,
         ),
     ],

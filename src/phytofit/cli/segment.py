@@ -26,7 +26,7 @@ def segment_command(
         list[str],
         typer.Argument(
             metavar="CLOUDS",
-            help="Clouds of whole plants (PLY, PCD, LAS/LAZ, XYZ, TXT, CSV, PTS, ASC), folders of them, or patterns.",
+            help="Clouds of plants (PLY, PCD, LAS/LAZ, E57, OBJ, XYZ, TXT, CSV, PTS, ASC), folders, or patterns.",
             show_default=False,
         ),
     ],

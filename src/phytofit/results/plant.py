@@ -1,6 +1,7 @@
 """What a reconstruction and a segmentation look like on disk: all of it, or nothing."""
 
 import json
+import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
@@ -199,7 +200,10 @@ def read_segmentation(folder: str | Path) -> Segmentation:
         settings = dict(said["settings"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{file}: expected what phytofit segment writes ({type(error).__name__}: {error})") from None
-    cloud = replace(read_cloud(file.with_name("plant.ply"), unit, plausible_cm=(0.0, np.inf)), name=name)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # they were shown when the cloud was read first
+        cloud = read_cloud(file.with_name("plant.ply"), unit, plausible_cm=(0.0, np.inf))
+    cloud = replace(cloud, name=name, notes=())
     assert cloud.labels is not None
     return Segmentation(cloud, cloud.labels, path, radius, up, leaves, notes, settings)
 

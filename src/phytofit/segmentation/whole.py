@@ -121,7 +121,8 @@ class Segmentation(Shown):
             labels[on_stem[below]] = 0
             labels[np.linalg.norm(points - leaf.collar, axis=1) < DOUBTFUL * radius] = 0
             name = f"{self.cloud.name}_leaf_{leaf.rank:02d}"
-            clouds.append(replace(self.cloud.take(index), labels=labels[index], name=name))
+            piece_cloud = self.cloud.take(index)
+            clouds.append(replace(piece_cloud, labels=labels[index], labels_from=None, name=name, notes=()))
         return clouds
 
 
