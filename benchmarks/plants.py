@@ -46,12 +46,12 @@ def turntable() -> None:
     plant = next(plant for plant in labelled_plants() if plant.data_set == "mccormick")
     mesh = plant.points / 10.0 * [-1.0, 1.0, 1.0]
     truth = phytofit.segment(phytofit.PointCloud(mesh, labels=plant.labels, name="mesh"), labelled=True)
-    points = aligned(made.segmentation.cloud.points, mesh)
+    points = aligned(made.segmentations[0].cloud.points, mesh)
     gap, nearest = cKDTree(mesh).query(points)
     there = gap < IN_MESH_CM
     of_point = np.where(there, truth.labels[nearest], 0)
-    found = score(made.segmentation.labels[there], of_point[there], 0.0)
-    of_all = score(made.segmentation.labels, truth.labels[nearest], 0.0)
+    found = score(made.segmentations[0].labels[there], of_point[there], 0.0)
+    of_all = score(made.segmentations[0].labels, truth.labels[nearest], 0.0)
     print(
         f"turntable: {found.found} leaves, {found.true} in the mesh, {found.hits} with IoU over 0.5; "
         f"IoU of the stem {found.stem:.2f}, of the leaves {found.leaves:.2f}, of all organs "
@@ -59,11 +59,11 @@ def turntable() -> None:
         f"{100 * np.mean(~there):.1f} % of the points, more than {IN_MESH_CM} cm off the mesh "
         f"(with them: stem {of_all.stem:.2f}, leaves {of_all.leaves:.2f})"
     )
-    print_copies(made.segmentation.cloud.points[there], of_point[there], found.true)
-    counted = np.zeros((len(truth.leaves), len(made.segmentation.leaves)))
+    print_copies(made.segmentations[0].cloud.points[there], of_point[there], found.true)
+    counted = np.zeros((len(truth.leaves), len(made.segmentations[0].leaves)))
     for i, leaf in enumerate(truth.leaves):
-        for j, other in enumerate(made.segmentation.leaves):
-            a, b = of_point == leaf.rank + 1, made.segmentation.labels == other.rank + 1
+        for j, other in enumerate(made.segmentations[0].leaves):
+            a, b = of_point == leaf.rank + 1, made.segmentations[0].labels == other.rank + 1
             counted[i, j] = np.sum(a & b) / max(1, np.sum(a | b))
     lengths = made.table[made.table["trait"] == "leaf_length"].set_index("rank")
     ways, off, all_ways, whole = ways_along_edges(), [], [], []
@@ -200,7 +200,7 @@ def plant_errors(folder: Path, leaves: list[Leaf], sided: bool) -> list[tuple[fl
         phytofit.write_cloud(file, phytofit.from_points(points, "cm", plausible_cm=(1.0, 1000.0)))
         made = run(file, Path(out) / "results", units="cm", up="z")
     table = made.table[made.table["organ"] == "leaf"]
-    tips = np.array([leaf.tip for leaf in made.segmentation.leaves])
+    tips = np.array([leaf.tip for leaf in made.segmentations[0].leaves])
     true_tips = np.array([leaf.organs[1].axis[-1] for leaf in leaves])
     gap = np.linalg.norm(true_tips[:, np.newaxis] - tips, axis=2)
     partner = dict(zip(*linear_sum_assignment(gap), strict=True))

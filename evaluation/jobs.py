@@ -1,9 +1,7 @@
 """Jobs done once: what each returned is kept, so that an evaluation that was stopped goes on from there."""
 
-import hashlib
 import sys
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +9,10 @@ from joblib import Memory, Parallel, delayed
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-import phytofit
+from phytofit.version import state_of_the_code
 
 KEPT = Path(__file__).parent / ".kept"  # what jobs returned, by state of the code
-SOURCES = (Path(phytofit.__file__).parent, Path(__file__).parent, Path(__file__).parents[1] / "benchmarks")
-LIBRARIES = ("numpy", "scipy", "numba")
+SOURCES = (Path(__file__).parent, Path(__file__).parents[1] / "benchmarks")  # beside the package
 COLUMNS = (
     TextColumn("{task.description}"),
     BarColumn(),
@@ -26,17 +23,6 @@ COLUMNS = (
 console = Console()
 
 
-def state_of_the_code() -> str:
-    """A name for the code as it is: what another state of it has kept is not this one's."""
-    found = hashlib.sha256(" ".join(version(name) for name in LIBRARIES).encode())
-    for folder in SOURCES:
-        for path in sorted(path for ending in ("*.py", "*.toml") for path in folder.rglob(ending)):
-            if any(part.startswith(".") for part in path.relative_to(folder).parts):
-                continue  # joblib keeps copies of functions beside what they returned
-            found.update(path.relative_to(folder.parent).as_posix().encode() + path.read_bytes())
-    return found.hexdigest()[:12]
-
-
 def run_all(
     function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], title: str, *, one_by_one: bool = False
 ) -> list[Any]:
@@ -44,7 +30,7 @@ def run_all(
 
     A job that this state of the code has done before, even in another run, is not done again.
     """
-    kept = Memory(KEPT / state_of_the_code(), verbose=0).cache(function)
+    kept = Memory(KEPT / state_of_the_code(SOURCES), verbose=0).cache(function)
     before = sum(kept.check_call_in_cache(*job) for job in jobs)
     work = Parallel(n_jobs=1 if one_by_one else -1, return_as="generator", batch_size=1)
     results = []

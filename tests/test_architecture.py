@@ -38,7 +38,7 @@ LAYERS = [
     {"cloud"},
     {"kernels"},
     {"display", "ordering", "parameters", "parsing", "small_files"},
-    {"bundled", "errors", "silence", "text"},
+    {"bundled", "errors", "silence", "text", "version"},
 ]
 DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}
 

@@ -65,12 +65,12 @@ def test_table_one_runs_and_is_not_done_twice(tmp_path, called):
 def test_another_state_of_the_code_keeps_apart(tmp_path, monkeypatch):
     (tmp_path / "a.py").write_text("x = 1\n")
     monkeypatch.setattr(jobs, "SOURCES", (tmp_path,))
-    before = jobs.state_of_the_code()
+    before = jobs.state_of_the_code(jobs.SOURCES)
     (tmp_path / ".kept").mkdir()
     (tmp_path / ".kept" / "func_code.py").write_text("x = 3\n")  # as joblib does
-    assert jobs.state_of_the_code() == before
+    assert jobs.state_of_the_code(jobs.SOURCES) == before
     (tmp_path / "a.py").write_text("x = 2\n")
-    assert jobs.state_of_the_code() != before
+    assert jobs.state_of_the_code(jobs.SOURCES) != before
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "evaluation").glob("*.py")), ids=lambda path: path.name)

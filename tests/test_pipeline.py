@@ -15,8 +15,10 @@ from phytofit import NoPhytomerError, fit, from_points, read_cloud, write_cloud
 from phytofit.cli import app
 from phytofit.errors import InputError, OutputError
 from phytofit.pipeline import plant_traits, run
+from phytofit.pipeline.stages import done, is_edited, key_of, up_to_date
 from phytofit.results import COLUMNS, read_segmentation
 from phytofit.segmentation import segment
+from phytofit.version import state_of_the_code
 from test_segmentation import leaf_axis, plant
 
 SCAN = Path(__file__).parents[1] / ".." / "shared" / "data" / "mccormick2016_turntable"
@@ -58,6 +60,16 @@ def made(tmp_path_factory):
     stages = []
     result = run(folder / "plant.ply", folder / "out", units="cm", up="z", progress=lambda *said: stages.append(said))
     return folder, known, result, stages
+
+
+@pytest.fixture(scope="module")
+def first_fit(made):
+    """The fit of the plant's first leaf, for tests of what becomes of a fit."""
+    return fit(made[2].segmentations[0].phytomers()[0], up="z", threads=1)
+
+
+def refuse(phytomer, **how):
+    raise NoPhytomerError("no stem with a leaf was found")
 
 
 def test_every_leaf_has_its_traits_and_the_plant_its_own(made):
@@ -122,60 +134,130 @@ def test_with_another_setting_the_stages_that_follow_from_it_are_done_again(made
     assert again.skipped == ("segment",)
 
 
-def test_a_leaf_that_can_t_be_fitted_keeps_its_length_and_is_not_tried_again(made, tmp_path, monkeypatch):
+def test_a_leaf_that_can_t_be_fitted_keeps_its_length_and_is_not_tried_again(made, first_fit, tmp_path, monkeypatch):
     shutil.copytree(made[0], tmp_path / "copy")
     out = tmp_path / "copy" / "out"
     tried = []
 
-    def refuse(phytomer, **how):
+    def seldom(phytomer, **how):
         tried.append(phytomer.name)
-        if how["seed"] == 2 and phytomer.name.endswith("leaf_01"):
-            return fit(phytomer, **how)
-        raise NoPhytomerError("no stem with a leaf was found")
+        return first_fit if how["seed"] == 2 and phytomer.name.endswith("leaf_01") else refuse(phytomer)
 
-    monkeypatch.setattr("phytofit.pipeline.fit", refuse)
+    monkeypatch.setattr("phytofit.pipeline.plant.fit", seldom)
     first, again, other = (
         run(tmp_path / "copy" / "plant.ply", out, units="cm", up="z", seed=seed, threads=1) for seed in (1, 1, 2)
     )
-    leaves = len(first.segmentation.leaves)
+    leaves = len(first.segmentations[0].leaves)
     assert len(tried) == 2 * leaves
     assert again.skipped == ("segment", *(f"leaf_{rank:02d}" for rank in range(1, leaves + 1)))
     pd.testing.assert_frame_equal(first.table, again.table)
     assert sum("not fitted: no stem with a leaf" in flag for flag in again.flags) == leaves
     lengths = again.table[again.table["trait"] == "leaf_length"]["value"].tolist()
-    assert lengths == [printed(leaf.length) for leaf in first.segmentation.leaves]
+    assert lengths == [printed(leaf.length) for leaf in first.segmentations[0].leaves]
     assert (out / "leaves" / "leaf_01" / "fit.json").exists()  # with another seed it could be fitted
     assert sum("not fitted" in flag for flag in other.flags) == leaves - 1
 
 
-def test_a_fit_that_leaves_most_of_the_points_out_is_not_the_leaf(made, tmp_path, monkeypatch):
+def test_a_fit_that_leaves_most_of_the_points_out_is_not_the_leaf(made, first_fit, tmp_path, monkeypatch):
     shutil.copytree(made[0], tmp_path / "copy")
 
-    def badly(phytomer, **how):
-        result = fit(phytomer, **how)
-        return replace(result, estimate=replace(result.estimate, share=np.array([0.1, 0.3, 0.6])))
-
-    monkeypatch.setattr("phytofit.pipeline.fit", badly)
+    bad = replace(first_fit, estimate=replace(first_fit.estimate, share=np.array([0.1, 0.3, 0.6])))
+    monkeypatch.setattr("phytofit.pipeline.plant.fit", lambda phytomer, **how: bad)
     found = run(tmp_path / "copy" / "plant.ply", tmp_path / "copy" / "out", units="cm", up="z", seed=1, threads=1)
     lengths = found.table[found.table["trait"] == "leaf_length"]
-    assert lengths["value"].tolist() == [printed(leaf.length) for leaf in found.segmentation.leaves]
+    assert lengths["value"].tolist() == [printed(leaf.length) for leaf in found.segmentations[0].leaves]
     assert all("not fitted: the model does not explain 60 % of the points" in flags for flags in lengths["flags"])
 
 
-def test_corrected_labels_are_taken_over(made, tmp_path):
+def test_corrected_labels_are_taken_over(made, tmp_path, monkeypatch):
+    monkeypatch.setattr("phytofit.pipeline.plant.fit", refuse)
     folder, known, _, _ = made
     corrected = read_cloud(folder / "out" / "segmentation" / "plant.ply", "cm", plausible_cm=(0.0, 500.0))
     last = corrected.labels.max()
     without = corrected.take(np.flatnonzero(corrected.labels != last))
     write_cloud(tmp_path / "corrected.ply", without)
     result = run(tmp_path / "corrected.ply", tmp_path / "out", units="cm", up="z", labels="label")
-    assert len(result.segmentation.leaves) == len(known.lengths) - 1
+    assert len(result.segmentations[0].leaves) == len(known.lengths) - 1
+
+
+def test_two_plants_in_one_cloud_are_both_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr("phytofit.pipeline.plant.fit", refuse)
+    points, *_ = plant(n_leaves=3, n_points=4000)
+    both = np.concatenate([points, 0.7 * points + np.array([0.0, 60.0, 0.0])])
+    write_cloud(tmp_path / "two.ply", from_points(both, "cm"))
+    out, stages = tmp_path / "out", []
+    made = run(tmp_path / "two.ply", out, units="cm", up="z", progress=lambda *said: stages.append(said))
+    assert [len(found.cloud) for found in made.segmentations] == [4000, 4000]
+    assert "2 plants were found, numbered along y" in made.notes
+    table = pd.read_csv(out / "traits.csv")
+    heights = table[table["trait"] == "plant_height"].set_index("plant")["value"]
+    assert heights[2] == pytest.approx(0.7 * heights[1], rel=0.02)
+    assert set(table["cloud"]) == {"two"}
+    assert table[table["trait"] == "leaf_length"].groupby("plant")["rank"].apply(list).to_dict() == {
+        1: [1, 2, 3],
+        2: [1, 2, 3],
+    }
+    assert {path.name for path in out.iterdir()} == {"plant_1", "plant_2", "traits.csv", "plant.png", "plants.png"}
+    assert ("fit", 4, 6) in stages
+    assert any(flag.startswith("plant 2: leaf 1: not fitted") for flag in made.flags)
+    again = run(tmp_path / "two.ply", out, units="cm", up="z")
+    assert again.skipped == ("segment", *(f"plant {i}: leaf_0{k}" for i in (1, 2) for k in (1, 2, 3)))
+    pd.testing.assert_frame_equal(again.table, made.table)
+    write_cloud(tmp_path / "two.ply", from_points(points, "cm"))  # one of them is gone
+    run(tmp_path / "two.ply", out, units="cm", up="z")
+    assert {path.name for path in out.iterdir()} >= {"segmentation", "leaves", "traits.csv", "plant.png"}
+    assert not list(out.glob("plant_*"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "null",
+        "[]",
+        5000 * "[",
+        "",
+        '{"made": 3}',
+        '{"phytofit": "0", "made": []}',
+        '{"made": {"plant.ply": 3}}',
+        "\0\xff",
+    ],
+)
+def test_a_record_of_another_shape_is_none(text, tmp_path):
+    (tmp_path / "stage.json").write_bytes(text.encode("latin-1"))
+    (tmp_path / "plant.ply").write_text("x")
+    key = key_of("segment", [], {})
+    assert not up_to_date(tmp_path, key)
+    assert not is_edited(tmp_path, "plant.ply")
+
+
+def test_what_made_nothing_is_not_up_to_date(tmp_path):
+    key = key_of("segment", [], {})
+    (tmp_path / "stage.json").write_text(json.dumps({**key, "made": {}}))
+    assert not up_to_date(tmp_path, key)
+    (tmp_path / "plant.ply").write_text("x")
+    done(tmp_path, key, ("plant.ply",))
+    assert up_to_date(tmp_path, key)
+    (tmp_path / "plant.ply").write_text("y")
+    assert not up_to_date(tmp_path, key)
+    assert is_edited(tmp_path, "plant.ply")
+
+
+def test_another_state_of_the_code_or_another_setting_is_another_key(tmp_path, monkeypatch):
+    (tmp_path / "a.py").write_text("x = 1\n")
+    before = state_of_the_code((tmp_path,))
+    (tmp_path / "a.py").write_text("x = 2\n")
+    assert state_of_the_code((tmp_path,)) != before
+    key = key_of("fit", [], {"seed": 0, "ranges": (1.0, np.float64(2.0))})
+    assert key == json.loads(json.dumps(key))
+    assert key != key_of("fit", [], {"seed": 1, "ranges": (1.0, np.float64(2.0))})
+    monkeypatch.setattr("phytofit.pipeline.stages.state_of_the_code", lambda: "another")
+    assert key != key_of("fit", [], {"seed": 0, "ranges": (1.0, np.float64(2.0))})
 
 
 def test_a_segmentation_comes_back_as_it_was_written(made):
     folder, _, result, _ = made
     back = read_segmentation(folder / "out" / "segmentation")
-    mine = result.segmentation
+    mine = result.segmentations[0]
     np.testing.assert_array_equal(back.labels, mine.labels)
     np.testing.assert_array_equal(back.stem_path, mine.stem_path)
     assert [leaf.rank for leaf in back.leaves] == [leaf.rank for leaf in mine.leaves]

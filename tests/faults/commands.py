@@ -16,7 +16,7 @@ from phytofit.results import COLUMNS
 from phytofit.segmentation import Segmentation, SegmentedLeaf
 
 PLOTS = ("results.phytomer.plot_fit", "results.phytomer.plot_convergence", "results.plant.plot_segmentation",
-         "results.plant.plot_reconstruction", "pipeline.plot_plant", "report.plot_agreement")  # fmt: skip
+         "results.plant.plot_reconstruction", "pipeline.plant.plot_plant", "report.plot_agreement")  # fmt: skip
 
 
 class World:
@@ -38,11 +38,11 @@ class World:
             module, _, attribute = name.rpartition(".")
             monkeypatch.setattr(importlib.import_module(f"phytofit.{module}"), attribute, function)
 
-        for module in ("fitting", "pipeline"):
+        for module in ("fitting", "pipeline.plant"):
             put(f"{module}.fit", lambda cloud, **how: self.fits[self.version])
-        for module in ("segmentation", "pipeline"):
+        for module in ("segmentation", "pipeline.plant"):
             put(f"{module}.segment", lambda cloud, **how: self.segmentations[self.version])
-        for module in ("reconstruct", "pipeline"):
+        for module in ("reconstruct", "pipeline.plant"):
             put(f"{module}.reconstruct", lambda *_, **how: self.reconstructions[self.version])
         for name in PLOTS:
             put(name, picture)

@@ -74,7 +74,7 @@ def test_whatever_one_leaf_raises_the_others_go_on(world, folder, monkeypatch):
             raise error
         return world.fits[0]
 
-    monkeypatch.setattr("phytofit.pipeline.fit", fit)
+    monkeypatch.setattr("phytofit.pipeline.plant.fit", fit)
     made = run(world, "run", folder, 0)
     assert "Traceback" not in made.output
     table = pd.read_csv(folder / "out" / "traits.csv")

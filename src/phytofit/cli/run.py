@@ -179,17 +179,20 @@ def _stages(told: Callable[[str, float], None]) -> Callable[[str, int, int], Non
 
 
 def _print_plant(made: "PlantRun") -> None:
-    whole = made.table[made.table["organ"] == "plant"].set_index("trait")[["value", "unit"]].to_dict("index")
-    said = [f"{str(trait).replace('_', ' ')} {row['value']:.3g} {row['unit']}" for trait, row in whole.items()]
-    say(f"{made.segmentation.cloud.name}: {', '.join(said).replace(' 1,', ',')}")
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for column in ("leaf", *SHOWN.values()):
-        table.add_column(column, justify="right", no_wrap=True)
-    leaves = made.table[made.table["organ"] == "leaf"]
-    for rank, mine in leaves.groupby("rank"):
-        of_leaf = mine.drop_duplicates("trait").set_index("trait")
-        table.add_row(str(rank), *(_with_interval(of_leaf, trait) for trait in SHOWN))
-    show(table)
+    n_plants = len(made.segmentations)
+    for number, found in enumerate(made.segmentations, start=1):
+        mine = made.table[made.table["plant"] == number]
+        whole = mine[mine["organ"] == "plant"].set_index("trait")[["value", "unit"]].to_dict("index")
+        said = [f"{str(trait).replace('_', ' ')} {row['value']:.3g} {row['unit']}" for trait, row in whole.items()]
+        name = f"{found.cloud.name}, plant {number} of {n_plants}" if n_plants > 1 else found.cloud.name
+        say(f"{name}: {', '.join(said).replace(' 1,', ',')}")
+        table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+        for column in ("leaf", *SHOWN.values()):
+            table.add_column(column, justify="right", no_wrap=True)
+        for rank, leaf in mine[mine["organ"] == "leaf"].groupby("rank"):
+            of_leaf = leaf.drop_duplicates("trait").set_index("trait")
+            table.add_row(str(rank), *(_with_interval(of_leaf, trait) for trait in SHOWN))
+        show(table)
     print_remarks(made.notes, made.flags)
     if made.skipped:
         say(f"up to date, not done again: {', '.join(made.skipped)}")

@@ -22,7 +22,7 @@ from phytofit.segmentation.organs import FLAT, along_path
 from phytofit.segmentation.root import Standing, ends_of, stands_on
 from phytofit.segmentation.whole import PLANT_CM
 
-__all__ = ["separate_plants"]
+__all__ = ["numbering", "separate_plants"]
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -86,7 +86,7 @@ def separate_plants(
     if len(plants) < 2:
         return (cloud,)
     bases = nodes[[plant.base for plant in plants]]
-    axis = int(np.argmax(np.ptp(bases, axis=0)))
+    axis = _axis_of(bases)
     plants = [plants[i] for i in np.argsort(bases[:, axis], kind="stable")]
     of_node = _share_out(nodes, np.repeat(np.arange(len(graphs)), np.diff(start)), plants)
     of_first = of_node[cKDTree(nodes).query(points)[1]]
@@ -95,8 +95,18 @@ def separate_plants(
     flat, flat_bases = (those - np.outer(those @ upward, upward) for those in (points[ground], bases))
     of_first[ground] = cKDTree(flat_bases).query(flat)[1]
     number = of_first[stands_for]
-    notes = (*cloud.notes, f"{len(plants)} plants were found, numbered along {'xyz'[axis]}")
+    notes = (*cloud.notes, numbering(bases))
     return tuple(replace(cloud.take(np.flatnonzero(number == i)), notes=notes) for i in range(len(plants)))
+
+
+def numbering(bases: FloatArray) -> str:
+    """How the plants with these bases (n, 3) are numbered, in words."""
+    return f"{len(bases)} plants were found, numbered along {'xyz'[_axis_of(bases)]}"
+
+
+def _axis_of(bases: FloatArray) -> int:
+    """The axis of the frame along which the bases lie farthest apart."""
+    return int(np.argmax(np.ptp(bases, axis=0)))
 
 
 def _pieces(points: FloatArray) -> list[PlantGraph]:

@@ -1,0 +1,330 @@
+"""From the images or the cloud of a plant, or of several, to the traits of all leaves: reconstruct, segment, fit."""
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from phytofit.cloud import PointCloud, read_cloud
+from phytofit.errors import CloudError, InputError, NoPhytomerError, NoStemError, OutputError, PhytofitError
+from phytofit.fitting import fit
+from phytofit.pipeline.stages import KEY, done, is_edited, key_of, up_to_date
+from phytofit.pipeline.traits import by_its_points, of_leaf, plant_traits
+from phytofit.plots import plot_plant, plot_plants
+from phytofit.recipe import recipe
+from phytofit.reconstruct import depth_files, reconstruct
+from phytofit.results import (
+    COLUMNS,
+    LOG,
+    OURS,
+    check_made,
+    check_reconstruction,
+    check_table,
+    delete_made,
+    is_our_picture,
+    prepare_folder,
+    read_segmentation,
+    read_table,
+    save_fit,
+    save_reconstruction,
+    save_segmentation,
+    trait_table,
+    whole_file,
+    whole_folder,
+    write_table,
+)
+from phytofit.segmentation import PLANT_CM, Segmentation, SegmentedLeaf, numbering, segment, separate_plants
+from phytofit.small_files import read_json
+from phytofit.species import Species, load_species
+from phytofit.text import one_line
+
+__all__ = ["PlantRun", "run"]
+
+MOST_OUTLIERS = 0.5  # share of a phytomer's points, beyond which what was fitted is not the leaf
+MADE = ("plant.ply", "segmentation.json")  # of a segmentation: what says whether it is up to date
+RECONSTRUCTION = "what phytofit reconstruct writes"
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class PlantRun:
+    """What became of a plant, or of several in one cloud: ``table`` of their traits (the columns of ``traits.csv``),
+    their ``segmentations`` in the order of the table's column ``plant``, ``flags`` in plain words, ``notes`` on what
+    was done to the cloud, and which stages were ``skipped``, being up to date."""
+
+    table: pd.DataFrame
+    segmentations: tuple[Segmentation, ...]
+    flags: tuple[str, ...]
+    notes: tuple[str, ...]
+    skipped: tuple[str, ...]
+
+
+def run(
+    source: str | Path,
+    folder: str | Path,
+    *,
+    camera: str | None = None,
+    units: str | None = None,
+    up: str | None = None,
+    step_deg: float | None = None,
+    unit: str | None = None,
+    poses: str | Path | None = None,
+    pattern: str = "*",
+    labels: str | None = None,
+    species: Species | str = "sorghum",
+    seed: int = 0,
+    threads: int | None = None,
+    progress: Progress = lambda stage, done, total: None,
+) -> PlantRun:
+    """Measure all leaves of a plant, or of each of several plants in one cloud.
+
+    Writes ``reconstruction/`` (of images), ``segmentation/``, ``leaves/leaf_01/`` and on, ``traits.csv`` over all, and
+    ``plant.png``; of several plants, the two latter lie in ``plant_1/`` and on, and ``plants.png`` shows which is
+    which.  A stage whose input, settings and code are those of its last run is not done again.
+
+    Parameters
+    ----------
+    source : a folder of depth images, with `camera`, `step_deg`, `unit`, `poses` and `pattern` as for
+        :func:`phytofit.reconstruct`; or a cloud in `units`, with `up` where it is known
+    labels : name of a property of the cloud that tells stem (1) and leaves (2..) instead of finding them, of one plant
+    species, seed, threads : as for :func:`phytofit.fit`
+    progress : called with a stage, and how much of how much of it is done
+
+    Raises InputError and NoStemError where nothing can be measured.  A leaf whose fit is refused keeps what its
+    segmentation tells.
+    """
+    source, folder = Path(source), Path(folder)
+    if source.is_dir() and source.resolve() == folder.resolve():
+        raise InputError(f"{folder}: the folder of the images can't hold the results; choose another folder")
+    name = source.resolve().stem if source.is_file() else source.resolve().name
+    _prepare(folder)
+    species = species if isinstance(species, Species) else load_species(species)
+    log = _Log(progress)
+    cloud_file = source
+    if source.is_dir():
+        if camera is None:
+            raise InputError(f"{source}: a folder of depth images needs its camera: a preset, or a TOML file")
+        how = {"camera": camera, "step_deg": step_deg, "unit": unit, "poses": poses, "pattern": pattern}
+        cloud_file, units, up = _reconstructed(source, folder, how, log), "cm", up or "z"
+    elif camera is not None:
+        raise InputError(f"{source}: a camera is for a folder of depth images, and this is none")
+    plants = _segmented(cloud_file, folder, {"name": name, "units": units, "up": up, "labels": labels}, log)
+    tables = _measured(plants, species, {"seed": seed, "threads": threads}, log)
+    whole = pd.concat(tables, ignore_index=True)
+    write_table(folder / "traits.csv", whole)
+    _forget_others(folder, plants)
+    found = [plant.found for plant in plants]
+    pictures = {"plant.png": plot_plant(found if len(found) > 1 else found[0], whole, title=name)}
+    if len(found) > 1:
+        pictures["plants.png"] = plot_plants(found, title=name)
+    for file, picture in pictures.items():
+        with whole_file(folder / file) as part:
+            picture.savefig(part, dpi=150, format="png", metadata=OURS)
+    return PlantRun(whole, tuple(found), tuple(log.flags), tuple(dict.fromkeys(log.notes)), tuple(log.skipped))
+
+
+@dataclass(frozen=True)
+class _Log:
+    """What happens on the way."""
+
+    progress: Progress
+    flags: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Plant:
+    """One of the plants of a cloud, numbered from 1; ``place`` is the folder of its stages, ``called`` what comes
+    before remarks on it: nothing where it is the only one."""
+
+    number: int
+    place: Path
+    called: str
+    found: Segmentation
+
+
+def _prepare(folder: Path) -> None:
+    """Repair what an earlier run left in the folder of a plant; OutputError if it can't hold one."""
+    prepare_folder(folder)
+    for place in (folder, *folder.glob("plant_*")):
+        for stage in (place / "reconstruction", place / "segmentation", place / "leaves"):
+            if stage.is_dir():
+                prepare_folder(stage)
+        for leaf in (place / "leaves").glob("leaf_*"):
+            prepare_folder(leaf)
+    check_table(folder / "traits.csv", COLUMNS)
+    for picture in ("plant.png", "plants.png"):
+        check_made(folder / picture, is_our_picture)
+    if any(folder.glob("*/fit.json")):
+        raise OutputError(f"{folder}: it holds results of single leaves; choose another folder for a whole plant")
+
+
+def _reconstructed(source: Path, folder: Path, how: Mapping[str, Any], log: _Log) -> Path:
+    """The file of the cloud that the images give."""
+    log.progress("reconstruct", 0, 1)
+    images = depth_files(source, how["pattern"])
+    given = [Path(file) for file in (how["camera"], how["poses"]) if file is not None and Path(file).is_file()]
+    settings = {name: None if value is None else str(value) for name, value in how.items()}
+    key = key_of("reconstruct", [*images, *given], {**recipe()["reconstruct"], **settings})
+    target = folder / "reconstruction"
+    if up_to_date(target, key):
+        log.skipped.append("reconstruct")
+    else:
+        check_reconstruction(target)
+        save_reconstruction(reconstruct(source, **how), target)
+        done(target, key, ("plant.ply", "reconstruction.json"))
+    said = read_json(target / "reconstruction.json", RECONSTRUCTION)
+    log.notes.extend(said["notes"])
+    log.flags.extend([*said["flags"], *(f"{v['file']} left out: {v['reason']}" for v in said["rejected"])])
+    return target / "plant.ply"
+
+
+def _segmented(cloud_file: Path, folder: Path, how: Mapping[str, Any], log: _Log) -> list[_Plant]:
+    """The plants of a cloud, taken apart; NoStemError if none can be."""
+    log.progress("segment", 0, 1)
+    labels = how["labels"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # they stand in the cloud's notes
+        cloud = read_cloud(cloud_file, how["units"], label_property=labels, plausible_cm=PLANT_CM)
+    cloud = replace(cloud, name=how["name"])
+    before = sorted(folder.glob("plant_*"))
+    for place in (folder, *before):
+        file = place / "segmentation" / "plant.ply"
+        if is_edited(file.parent, file.name):
+            raise InputError(
+                f"{file}: it was changed since it was written; to use its labels, measure that file and name the "
+                f"property that holds them, label, and choose another folder; or delete {file.parent} to begin anew"
+            )
+    log.notes.extend(cloud.notes)
+    settings = {**recipe()["segment"], **how}
+    for n in {1, len(before)}:
+        places = _places(folder, n)
+        keys = [key_of("segment", [cloud_file], {**settings, "plant": i, "of": n}) for i in range(1, n + 1)]
+        if n and all(up_to_date(at / "segmentation", key) for at, key in zip(places, keys, strict=True)):
+            log.skipped.append("segment")
+            return _plants([read_segmentation(at / "segmentation") for at in places], folder, log)
+    found = _taken_apart(cloud, how["up"], labelled=labels is not None)
+    for number, (one, place) in enumerate(zip(found, _places(folder, len(found)), strict=True), start=1):
+        save_segmentation(one, prepare_folder(place), "segmentation")
+        key = key_of("segment", [cloud_file], {**settings, "plant": number, "of": len(found)})
+        done(place / "segmentation", key, MADE)
+    return _plants(found, folder, log)
+
+
+def _taken_apart(cloud: PointCloud, up: str | None, *, labelled: bool) -> list[Segmentation]:
+    """Each plant of a cloud that can be taken apart; NoStemError if none can be."""
+    clouds = (cloud,) if labelled else separate_plants(cloud, up=up)
+    found, failed = [], []
+    for plant in clouds:
+        try:
+            found.append(segment(plant, up=up, labelled=labelled))
+        except NoStemError as error:
+            failed.append(error)
+    if not found:
+        raise failed[0]
+    if failed:
+        note = f"{len(clouds)} plants were found, and {len(failed)} of them not measured: {failed[0]}"
+        found[0] = replace(found[0], notes=(*found[0].notes, note))
+    return found
+
+
+def _places(folder: Path, n: int) -> list[Path]:
+    """The folders of the stages of `n` plants."""
+    return [folder] if n == 1 else [folder / f"plant_{i}" for i in range(1, n + 1)]
+
+
+def _plants(found: Sequence[Segmentation], folder: Path, log: _Log) -> list[_Plant]:
+    """The plants, numbered; what is remarkable about them goes into the log."""
+    places = _places(folder, len(found))
+    plants = [
+        _Plant(number, place, f"plant {number}: " if len(found) > 1 else "", one)
+        for number, (place, one) in enumerate(zip(places, found, strict=True), start=1)
+    ]
+    if len(found) > 1:
+        log.notes.append(numbering(np.array([one.stem_path[0] for one in found])))
+    for plant in plants:
+        log.notes.extend(f"{plant.called}{note}" for note in plant.found.notes)
+        flags = ((leaf.rank, flag) for leaf in plant.found.leaves for flag in leaf.flags)
+        log.flags.extend(f"{plant.called}leaf {rank}: {flag}" for rank, flag in flags)
+    return plants
+
+
+def _forget_others(folder: Path, plants: list[_Plant]) -> None:
+    """Delete what phytofit made of plants and leaves that an earlier run saw, and this one does not."""
+    own = {plant.place for plant in plants}
+    for place in (folder, *sorted(folder.glob("plant_*"))):
+        n_leaves = next((len(plant.found.leaves) for plant in plants if plant.place == place), 0)
+        for leaf in sorted((place / "leaves").glob("leaf_*"))[n_leaves:]:
+            delete_made(leaf)
+        if place not in own:
+            for old in (place / "segmentation", place / "leaves", *([] if place == folder else [place])):
+                if old.is_dir():
+                    delete_made(old)
+
+
+def _measured(plants: list[_Plant], species: Species, how: Mapping[str, Any], log: _Log) -> list[pd.DataFrame]:
+    """The traits of all plants, their leaves fitted one after the other."""
+    tables, n_leaves, n_done = [], sum(len(plant.found.leaves) for plant in plants), 0
+    for plant in plants:
+        name = plant.found.cloud.name
+        tables.append(trait_table(name, plant_traits(plant.found), plant=plant.number))
+        for leaf, phytomer in zip(plant.found.leaves, plant.found.phytomers(), strict=True):
+            log.progress("fit", n_done, n_leaves)
+            table = _fitted(plant, leaf, phytomer, species, how, log)
+            tables.append(of_leaf(table, name, plant.number, leaf.rank))
+            n_done += 1
+    log.progress("fit", n_leaves, n_leaves)
+    return tables
+
+
+def _fitted(
+    plant: _Plant, leaf: SegmentedLeaf, phytomer: PointCloud, species: Species, how: Mapping[str, Any], log: _Log
+) -> pd.DataFrame:
+    """The traits of one leaf, by its fit; where that is refused, its length along its points."""
+    name = f"leaf_{leaf.rank:02d}"
+    target = plant.place / "leaves" / name
+    segmented = [plant.place / "segmentation" / file for file in MADE]
+    acting = {step: settings for step, settings in recipe().items() if step not in ("reconstruct", "segment")}
+    key = key_of(name, segmented, {**acting, "species": _content(species), "seed": how["seed"]})
+    if up_to_date(target, key):
+        log.skipped.append(f"{plant.called}{name}")
+    else:
+        try:
+            fitted = fit(phytomer, species=species, up=plant.found.up, **how)
+            assert fitted.estimate is not None
+            outliers = float(fitted.estimate.share[2])
+            if outliers > MOST_OUTLIERS:
+                raise NoPhytomerError(f"the model does not explain {100 * outliers:.0f} % of the points")
+            save_fit(fitted, phytomer, target.parent, name)
+            done(target, key, ("traits.csv",))
+        except (NoPhytomerError, CloudError) as error:
+            _save_by_points(plant, leaf, str(error), target, key)
+        except PhytofitError:
+            raise
+        except Exception as error:  # whatever it is, the other leaves go on
+            LOG.exception("%s: a fault of phytofit", name)
+            reason = f"a fault of phytofit, {type(error).__name__}: {one_line(error)}"
+            _save_by_points(plant, leaf, reason, target, key_of(name, [], {"fault": reason}))  # to be tried again
+    table = read_table(target / "traits.csv")
+    flags = "; ".join(table["flags"].dropna()).split("; ")
+    log.flags.extend(f"{plant.called}leaf {leaf.rank}: {flag}" for flag in dict.fromkeys(flags) if flag)
+    return table
+
+
+def _content(species: Species) -> dict[str, Any]:
+    """All that a species says, whatever its file is called."""
+    prior = [asdict(parameter) for parameter in species.space.parameters]
+    return {"name": species.name, "model": repr(species.model), "prior": prior, "ranges": species.ranges.tolist()}
+
+
+def _save_by_points(plant: _Plant, leaf: SegmentedLeaf, reason: str, target: Path, key: Mapping[str, Any]) -> None:
+    """In place of a fit, the length of a leaf along its points."""
+    with whole_folder(target.parent, target.name, KEY, "fit.json") as part:
+        trait = by_its_points(plant.found, leaf, reason)
+        write_table(part / "traits.csv", trait_table(plant.found.cloud.name, [trait], plant=plant.number))
+        done(part, key, ("traits.csv",))
