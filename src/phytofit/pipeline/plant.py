@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from phytofit.cloud import PointCloud, read_cloud
+from phytofit.display import Shown, Summary
 from phytofit.errors import CloudError, InputError, NoPhytomerError, NoStemError, OutputError, PhytofitError
 from phytofit.fitting import fit
 from phytofit.pipeline.stages import KEY, done, is_edited, key_of, up_to_date
@@ -50,8 +52,8 @@ RECONSTRUCTION = "what phytofit reconstruct writes"
 Progress = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class PlantRun:
+@dataclass(frozen=True, repr=False)
+class PlantRun(Shown):
     """What became of a plant, or of several in one cloud: ``table`` of their traits (the columns of ``traits.csv``),
     their ``segmentations`` in the order of the table's column ``plant``, ``flags`` in plain words, ``notes`` on what
     was done to the cloud, and which stages were ``skipped``, being up to date."""
@@ -61,6 +63,24 @@ class PlantRun:
     flags: tuple[str, ...]
     notes: tuple[str, ...]
     skipped: tuple[str, ...]
+
+    def summary(self) -> Summary:
+        """The traits of each plant and of its leaves, and the flags."""
+        columns = ["plant", "organ", "rank", "trait", "value", "unit"]
+        cells = self.table[columns].to_numpy().tolist()
+        rows = [[str(n), organ, str(rank or ""), trait, f"{value:.2f}", u] for n, organ, rank, trait, value, u in cells]
+        n_leaves = " and ".join(str(len(found.leaves)) for found in self.segmentations)
+        title = f"{self.segmentations[0].cloud.name}: {n_leaves} leaves"
+        head = ("plant", "organ", "leaf", "trait", "value", "unit")
+        return Summary(title, head, rows, [f"flag: {flag}" for flag in self.flags])
+
+    def to_frame(self) -> pd.DataFrame:
+        """All traits as a table, with the columns of ``traits.csv``."""
+        return self.table.copy()
+
+    def plot(self) -> Figure:
+        """Each plant with its leaves coloured and numbered, beside their traits: ``plant.png``."""
+        return plot_plant(self.segmentations, self.table, title=self.segmentations[0].cloud.name)
 
 
 def run(
@@ -118,7 +138,7 @@ def run(
     write_table(folder / "traits.csv", whole)
     _forget_others(folder, plants)
     found = [plant.found for plant in plants]
-    pictures = {"plant.png": plot_plant(found if len(found) > 1 else found[0], whole, title=name)}
+    pictures = {"plant.png": plot_plant(found, whole, title=name)}
     if len(found) > 1:
         pictures["plants.png"] = plot_plants(found, title=name)
     for file, picture in pictures.items():
