@@ -293,7 +293,7 @@ def test_phyllotaxy_follows_from_azimuths():
         (["nothing.ply", "--units", "cm"], "nothing.ply"),
         (["plant.ply"], "unit"),
         (["images", "--camera", "kinect-v2"], "view.png"),
-        (["images", "--camera", "kinect-v2", "--pattern", "/x/*.png"], "--pattern"),
+        (["images", "--camera", "kinect-v2", "--pattern", "/x/*.png"], "pattern: expected one such as"),
         (["out", "--camera", "kinect-v2"], "can't hold the results"),
     ],
 )
