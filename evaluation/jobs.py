@@ -9,7 +9,7 @@ from joblib import Memory, Parallel, delayed
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from phytofit.version import state_of_the_code
+import phytofit.version
 
 KEPT = Path(__file__).parent / ".kept"  # what jobs returned, by state of the code
 SOURCES = (Path(__file__).parent, Path(__file__).parents[1] / "benchmarks")  # beside the package
@@ -30,7 +30,7 @@ def run_all(
 
     A job that this state of the code has done before, even in another run, is not done again.
     """
-    kept = Memory(KEPT / state_of_the_code(SOURCES), verbose=0).cache(function)
+    kept = Memory(KEPT / phytofit.version.state_of_the_code(SOURCES), verbose=0).cache(function)
     before = sum(kept.check_call_in_cache(*job) for job in jobs)
     work = Parallel(n_jobs=1 if one_by_one else -1, return_as="generator", batch_size=1)
     results = []

@@ -15,6 +15,7 @@ import pytest
 from scipy import stats
 
 import phytofit
+import phytofit.version
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
@@ -65,12 +66,12 @@ def test_table_one_runs_and_is_not_done_twice(tmp_path, called):
 def test_another_state_of_the_code_keeps_apart(tmp_path, monkeypatch):
     (tmp_path / "a.py").write_text("x = 1\n")
     monkeypatch.setattr(jobs, "SOURCES", (tmp_path,))
-    before = jobs.state_of_the_code(jobs.SOURCES)
+    before = phytofit.version.state_of_the_code(jobs.SOURCES)
     (tmp_path / ".kept").mkdir()
     (tmp_path / ".kept" / "func_code.py").write_text("x = 3\n")  # as joblib does
-    assert jobs.state_of_the_code(jobs.SOURCES) == before
+    assert phytofit.version.state_of_the_code(jobs.SOURCES) == before
     (tmp_path / "a.py").write_text("x = 2\n")
-    assert jobs.state_of_the_code(jobs.SOURCES) != before
+    assert phytofit.version.state_of_the_code(jobs.SOURCES) != before
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "evaluation").glob("*.py")), ids=lambda path: path.name)
