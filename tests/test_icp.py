@@ -152,7 +152,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 @pytest.mark.parametrize("memory", [0, 5])
 @given(seed=SEEDS, degrees=st.floats(0, 6))
-@settings(max_examples=25)
+@settings(max_examples=10)
 def test_a_copy_is_laid_where_both_oracles_lay_it(memory, seed, degrees):
     problem = copies(seed, degrees, shift=0.1)
     expected = besl_mckay(problem)
@@ -166,7 +166,7 @@ def test_a_copy_is_laid_where_both_oracles_lay_it(memory, seed, degrees):
 
 
 @given(seed=SEEDS, n=st.integers(3, 60))
-@settings(max_examples=20)
+@settings(max_examples=8)
 def test_plain_icp_is_besl_mckay_where_no_match_is_in_doubt(seed, n):
     """Points a centimetre apart, all placed within 0.35 cm of their partner: every look-up has one possible answer."""
     random = np.random.default_rng(seed)
@@ -186,7 +186,7 @@ def test_plain_icp_is_besl_mckay_where_no_match_is_in_doubt(seed, n):
 
 
 @given(seed=SEEDS, degrees=st.floats(0, 180))
-@settings(max_examples=25)
+@settings(max_examples=10)
 def test_where_plain_icp_rests_besl_mckay_rests(seed, degrees):
     """From any start: going on with exact matches gains no more than the look-ups' error, a cell's diagonal."""
     problem = noisy(seed, degrees, shift=1.0)
@@ -200,7 +200,7 @@ def test_where_plain_icp_rests_besl_mckay_rests(seed, degrees):
 
 
 @given(seed=SEEDS, degrees=st.floats(0, 20))
-@settings(max_examples=20)
+@settings(max_examples=8)
 def test_noisy_surfaces_end_as_near_as_the_oracles(seed, degrees):
     problem = noisy(seed, degrees)
     (r, t, _, _, _), diagonal = solve(problem)
@@ -212,12 +212,12 @@ def test_noisy_surfaces_end_as_near_as_the_oracles(seed, degrees):
 @pytest.mark.parametrize("memory", [0, 1, 5, MAX_MEMORY])
 def test_never_worse_however_early_it_ends(memory):
     """The pose that comes out has been matched, or is a plain step from one that has; and every round gains."""
-    for seed in range(40):
-        problem = noisy(seed, 30.0 + 4 * seed, shift=1.0, n=60)
+    for seed in range(10):
+        problem = noisy(seed, 30.0 + 16 * seed, shift=1.0, n=60)
         grid, _ = look_up(problem)
         cancellation = CANCELLATION * np.abs(problem.target).max() ** 2
         last_mse = np.inf
-        for max_iterations in range(1, 11):
+        for max_iterations in (1, 2, 3, 5, 8, 10):
             r, t, mse, iterations, _ = register(problem, grid, memory, max_iterations)
             assert iterations <= max_iterations
             assert error(problem, r, t) <= np.sqrt(mse + cancellation)
@@ -228,7 +228,7 @@ def test_never_worse_however_early_it_ends(memory):
 
 def test_mixing_is_as_good_as_plain_icp():
     ratios = []
-    for seed in range(20):
+    for seed in range(10):
         problem = noisy(seed, 10.0)
         grid, _ = look_up(problem)
         plain, mixed = (error(problem, *register(problem, grid, memory)[:2]) for memory in (0, 5))
@@ -238,7 +238,7 @@ def test_mixing_is_as_good_as_plain_icp():
 
 
 def test_no_more_than_the_largest_memory_is_mixed():
-    for seed in range(8):
+    for seed in range(2):
         problem = noisy(seed, 20.0, n=800, noise=0.0)
         grid, _ = look_up(problem)
         most, more = (register(problem, grid, memory, 60) for memory in (MAX_MEMORY, 10 * MAX_MEMORY))
@@ -249,7 +249,7 @@ def test_no_more_than_the_largest_memory_is_mixed():
 def test_mixing_is_nearer_after_few_rounds():
     """Where the source slides along a smooth surface plain ICP creeps."""
     ratios = []
-    for seed in range(10):
+    for seed in range(6):
         problem = noisy(seed, 20.0, n=800, noise=0.0)
         grid, _ = look_up(problem)
         plain, mixed = (error(problem, *register(problem, grid, memory, 10)[:2]) for memory in (0, 5))
@@ -280,7 +280,7 @@ CUBE = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
 @example(TWO, 3 * TWO, 3, 5)
 @example(CUBE, CUBE, 4, 5)
 @example(np.repeat(ONE, 6, axis=0), CUBE, 5, 0)
-@settings(max_examples=100)
+@settings(max_examples=40)
 def test_few_tied_planar_and_collinear_points(source, target, seed, memory):
     random = np.random.default_rng(seed)
     r_start = Rotation.random(rng=random).as_matrix()
@@ -316,7 +316,7 @@ def test_a_collinear_cloud_may_turn_only_about_itself():
 
 
 @given(seed=SEEDS)
-@settings(max_examples=15)
+@settings(max_examples=6)
 def test_a_mirrored_copy_is_never_reflected(seed):
     """The reflection would lay it exactly; the rotation is what is asked for."""
     problem = copies(seed, 5.0)
@@ -389,7 +389,7 @@ def crosses():
 @example(np.diag([5.0, 0.0, 0.0]))
 @example(np.diag([-5.0, 0.0, 0.0]))
 @example(np.diag([1e8, 1.0, 1e-8]))
-@settings(max_examples=200)
+@settings(max_examples=80)
 def test_best_rotation_is_proper_and_best(cross):
     r = best_rotation(np.ascontiguousarray(cross))
     assert_proper(r)

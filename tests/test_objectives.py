@@ -41,8 +41,8 @@ def moved_candidate(species, x, pose, seed=0):
 def test_error_is_the_exact_hausdorff_distance_at_the_registered_pose(scene):
     species, points, _, xs = scene
     objective = PaperObjective(species.model, Reference.of(points), n_points=N_POINTS)
-    errors = objective(xs[:8])
-    for x, error in zip(xs[:8], errors, strict=True):
+    errors = objective(xs[:4])
+    for x, error in zip(xs[:4], errors, strict=True):
         registration, again = objective.register(x)
         placed, _ = moved_candidate(species, x, registration.T_target_source)
         assert again == error
@@ -108,7 +108,7 @@ def test_an_upside_down_start_is_found(scene):
         n_points=N_POINTS,
     )
     right_way_up = PaperObjective(species.model, Reference.of(points), n_points=N_POINTS)
-    assert np.median(objective(xs[:10])) == pytest.approx(np.median(right_way_up(xs[:10])), abs=0.3)
+    assert np.median(objective(xs[:6])) == pytest.approx(np.median(right_way_up(xs[:6])), abs=0.3)
 
 
 @pytest.mark.parametrize("name", sorted(set(DISTANCES) - {"labels"}))
@@ -151,8 +151,7 @@ def brute_labelled(a, label_a, b, label_b, cost):
     return max(d.min(axis=1).max(), d.min(axis=0).max())
 
 
-@pytest.mark.parametrize("unknown_share", [0.0, 0.3])
-@pytest.mark.parametrize("cost", [0.0, 2.0, 50.0])
+@pytest.mark.parametrize(("cost", "unknown_share"), [(0.0, 0.0), (2.0, 0.0), (2.0, 0.3), (50.0, 0.3)])
 def test_labelled_hausdorff_against_brute_force(scene, unknown_share, cost):
     species, points, organ, xs = scene
     labels = organ.copy()

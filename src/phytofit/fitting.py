@@ -19,7 +19,7 @@ from phytofit.fitted import Fit, beside_its_rival, remarked
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parsing import checked_flag, checked_number, checked_whole, parse_points, parse_up
-from phytofit.pose import StartPose
+from phytofit.pose import StartPose, parts_of_stem
 from phytofit.posterior import DITHER_CM, estimate
 from phytofit.preparation import Prepared, prepare
 from phytofit.species import Species, load_species
@@ -317,22 +317,26 @@ def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
 
 
 def _beside_its_stem(result: Fit, found: Prepared) -> Fit:
-    """The result, with a flag where the cloud's stem, as the start pose saw it, does not end as `stem_above` says."""
+    """The result, with a flag where the cloud's stem does not end as `stem_above` says: as the start pose saw it, and
+    as the leaf's points beside the fitted stem say too, since either may be wrong."""
     how = str(result.settings["stem_above"])
     axis = result.pose[:3, 2]
     along = [float((found.home @ start.pose)[:3, 2] @ axis) for start in found.starts]
     best = int(np.argmax(np.abs(along)))
-    below, above = -found.starts[best].foot, found.starts[best].top
-    if along[best] < 0.0:
-        below, above = above, below
-    alike = min(below, above) > LEAST_ALIKE * max(below, above)
-    if how == "free" or alike == (how == "equal"):
+    start = found.starts[best]
+    below, above = (-start.foot, start.top) if along[best] > 0.0 else (start.top, -start.foot)
+    points = (result.reference - result.pose[:3, 3]) @ result.pose[:3, :3] / result.scale
+    again = parts_of_stem(points, max(start.radius, 0.5 * float(result.x[0])))
+    if how == "free" or again is None:
+        return result
+    alike = [min(parts) > LEAST_ALIKE * max(parts) for parts in ((below, above), again)]
+    if alike[0] != alike[1] or alike[0] == (how == "equal"):
         return result
     unit = "" if result.relative else " cm"
     over, under = (f"{length * found.scale:.3g}{unit}" for length in (above, below))
     text = (
         f"the stem goes on {over} above the leaf and {under} below it: "
-        f"stem_above={'equal' if alike else 'free'!r} may fit better than {how!r}"
+        f"stem_above={'equal' if alike[0] else 'free'!r} may fit better than {how!r}"
     )
     return replace(result, flags=(*result.flags, text))
 

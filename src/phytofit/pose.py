@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from phytofit.errors import NoPhytomerError
 from phytofit.kernels.neighbors import near_line
 
-__all__ = ["StartPose", "near_stem", "start_poses", "with_tube"]
+__all__ = ["StartPose", "near_stem", "parts_of_stem", "start_poses", "with_tube"]
 
 FloatArray = NDArray[np.float64]
 N_POINTS = 2000  # of the cloud, evenly by index: enough to see a stem by
@@ -28,6 +28,7 @@ MAX_AROUND = 1.5  # points close around a stem over those on it: a leaf's base g
 MAX_SLOPE = 2.0  # of a leaf's base, rise over run, when it is followed into the stem
 MAX_TILT_COSINE = 0.34  # with `up` given, a stem leans by less than 70 degrees
 STEM_MARGIN, STEM_MARGIN_CM = 1.3, 1.0  # of its radius, and more, around a stem within which points may be the stem's
+BESIDE_CM = 8.0  # of a leaf, from its stem: so far it is nearly straight
 N_TUBES, TUBE_NOISE_CM = 2, 0.4  # fits, each to the points around the one before; from where a point counts little
 TUBE_SLOPE, TUBE_WIDER = 0.4, 1.5  # from the line that it starts from, at most: cm sideways per cm along; times
 
@@ -214,6 +215,22 @@ def _height_at_axis(distance: FloatArray, height: FloatArray, n_bins: int = 8) -
         return float(np.median(height))
     slope = np.median((h[j] - h[i])[apart] / (d[j] - d[i])[apart])
     return float(np.median(h - np.clip(slope, -MAX_SLOPE, MAX_SLOPE) * d))
+
+
+def parts_of_stem(points: FloatArray, radius: float) -> tuple[float, float] | None:
+    """How far a stem goes on below and above its leaf, cm, by points (n, 3) in the frame of a fitted model: the stem
+    along z, the leaf on +x.  None where too few points are of the leaf beside it."""
+    distance, margin = np.hypot(points[:, 0], points[:, 1]), STEM_MARGIN * radius + STEM_MARGIN_CM
+    on_stem = distance < margin
+    if on_stem.sum() < LEAST_NEAR:
+        return None
+    foot, top = np.quantile(points[on_stem, 2], [0.01, 0.99])
+    beside = (np.abs(points[:, 1]) < points[:, 0]) & ~on_stem & (distance < margin + BESIDE_CM)
+    beside &= (points[:, 2] > foot - radius) & (points[:, 2] < top + radius)
+    if beside.sum() < LEAST_NEAR:
+        return None
+    collar = _height_at_axis(distance[beside], points[beside, 2])
+    return max(collar - float(foot), 0.0), max(float(top) - collar, 0.0)
 
 
 def _differ(c0: FloatArray, a0: FloatArray, c1: FloatArray, a1: FloatArray, radius: float) -> bool:
