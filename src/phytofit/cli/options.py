@@ -63,7 +63,7 @@ def numeric(
 
     def check(value: float | None) -> float | None:
         if value is None or (least <= value <= most and above < value < below and math.isfinite(value)):
-            return value
+            return None if value is None else value + 0  # -0.0 becomes 0.0
         raise typer.BadParameter(f"expected {expected}, got {value:g}")
 
     return typer.Option(*names, help=help, callback=check)

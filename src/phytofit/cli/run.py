@@ -1,6 +1,7 @@
 """The command that measures whole plants."""
 
 import math
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -148,6 +149,8 @@ def _run_all(plants: list[Path], settings: dict[str, Any], folder: Path) -> None
     for i, (source, name) in enumerate(zip(plants, result_names(plants), strict=True)):
         where = folder if alone else folder / name
         try:
+            if not os.path.exists(source):  # noqa: PTH110  (pathlib raises where a name is too long)
+                raise InputError(f"{source}: no such file or folder; check the path")
             with items.item(i, name) as told:
                 made = run(source, where, **settings, progress=_stages(told))
         except Exception as error:

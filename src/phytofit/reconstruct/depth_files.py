@@ -50,7 +50,7 @@ def depth_files(folder: Path, pattern: str = "*") -> list[Path]:
         raise InputError(f"{folder}: {found}, expected a folder of depth images{what}")
     try:
         there = [path for path in folder.glob(pattern) if path.is_file() and not path.name.startswith(".")]
-    except (NotImplementedError, ValueError, OSError) as error:  # an absolute pattern, or none
+    except (NotImplementedError, ValueError, IndexError, OSError) as error:  # an absolute pattern, or none
         raise SettingError(
             f"pattern: expected one such as 'depth_*.png', within the folder, got {shortened(repr(pattern))} ({error})"
         ) from None
