@@ -10,12 +10,11 @@ cut        leaves with their piece of stem, cut from the labelled plants: seedli
 """
 
 import argparse
-import multiprocessing
 import os
-import sys
 from collections import defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from typing import NamedTuple
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thread
@@ -23,7 +22,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thr
 import cut_leaves
 import numpy as np
 import trimesh
-from accuracy import DATA, MM, clouds, progress
+from common import DATA, clouds, progress, read, run_parts
 from robustness import HOLES, NOISE, OUTLIERS, POINTS, SWEEPS, TIPS, VIEWS
 from scipy.spatial.transform import Rotation
 
@@ -185,8 +184,8 @@ def on_box(random: np.random.Generator, n: int, sides: np.ndarray) -> np.ndarray
 
 def papers() -> Iterator[Cloud]:
     for path in clouds():
-        cloud = phytofit.read_cloud(path, "mm" if path.stem in MM else "cm")
-        yield Cloud(f"sodhi2018 {path.relative_to(DATA).parts[0]}", f"{path.parent.name} {path.stem}", cloud.points)
+        kind, name = f"sodhi2018 {path.relative_to(DATA).parts[0]}", f"{path.parent.name} {path.stem}"
+        yield Cloud(kind, name, read(path).points)
 
 
 def simulated(number: int) -> Cloud:
@@ -241,19 +240,18 @@ def main() -> None:
     parser.add_argument("--phytomers", type=int, default=200, help="simulated ones")
     parser.add_argument("--each", action="store_true", help="what is said of each cloud")
     arguments = parser.parse_args()
-    parts = {
+    wanted = {
         "others": lambda: (list(others()), True),
         "phytomers": lambda: ([*papers(), *map(simulated, range(arguments.phytomers))], False),
         "cut": lambda: (list(cut()), False),
     }
-    unknown = set(arguments.parts) - set(parts)
-    if unknown:
-        sys.exit(f"no part is called {', '.join(unknown)}; there are {', '.join(parts)}")
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn")) as pool:
-        for name in arguments.parts or parts:
-            print(f"\n{name}")
-            those, wanted = parts[name]()
-            report(pool, those, arguments.each, wanted=wanted)
+
+    def part(name: str, pool: ProcessPoolExecutor) -> None:
+        print(f"\n{name}")
+        those, refuse = wanted[name]()
+        report(pool, those, arguments.each, wanted=refuse)
+
+    run_parts({name: partial(part, name) for name in wanted}, arguments.parts)
 
 
 if __name__ == "__main__":

@@ -44,6 +44,7 @@ ADVICE = {  # of the library, and the option that follows it
     r"\bstate the unit of depths\b": "--depth-unit",
     r"\b[Ss]tate up\b": "--up",
     r"\bname the property\b": "--labels",
+    r"\bgive a seed point\b": "--seed-point",
     r"\bthis looks like a whole plant\b": "phytofit run measures it",
 }
 
