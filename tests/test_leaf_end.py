@@ -167,7 +167,7 @@ def test_an_organ_goes_straight_on_beyond_its_end():
     assert longer.half_width[-1] == 0.0
 
 
-@pytest.mark.parametrize("seed", [11, 12])
+@pytest.mark.parametrize("seed", [11, pytest.param(12, marks=pytest.mark.long)])
 def test_a_leaf_with_a_hollow_tip_has_its_own_length(seed):
     """What no taper of the model is like: a blade that is bent and twisted, and thin over its last quarter."""
     shape = {"leaf_bow": 25.0, "leaf_side_bend": 20.0, "leaf_twist": 40.0, "leaf_base_width": 0.5, "leaf_taper": 1.0}

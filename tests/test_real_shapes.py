@@ -311,7 +311,7 @@ def test_a_longer_leaf_is_begun_only_where_points_are_left_over():
     assert list(longer_leaf(likelihood.with_theta(state, theta))) == []
 
 
-@pytest.mark.parametrize("seed", [5000, 5007, 5021])
+@pytest.mark.parametrize("seed", [5000, *(pytest.param(seed, marks=pytest.mark.long) for seed in (5007, 5021))])
 def test_a_stem_that_one_camera_saw_keeps_its_diameter(seed):
     """As a whole tube it would come out 0.7 cm too thin."""
     made = phytofit.simulate(seed=seed, n_views=1)
@@ -321,7 +321,7 @@ def test_a_stem_that_one_camera_saw_keeps_its_diameter(seed):
     assert any("seen from one side" in flag for flag in result.flags)
 
 
-@pytest.mark.parametrize("taper", [-0.04, 0.05, 0.1])
+@pytest.mark.parametrize("taper", [-0.04, 0.1, pytest.param(0.05, marks=pytest.mark.long)])
 def test_a_stem_that_tapers_keeps_its_diameter_and_its_leaf(taper):
     made = grown(collar_offset=1.0, stem_taper=taper, leaf_side_bend=20.0, n_points=4000)
     result = fitted(made)

@@ -31,13 +31,20 @@ def crowded():
     return made, every @ made.pose[:3, :3].T + made.pose[:3, 3], on_leaf
 
 
+@pytest.fixture(scope="module")
+def seeded(crowded):
+    """The fit of the crowded phytomer with a seed point on its leaf."""
+    made, points, on_leaf = crowded
+    return phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
+
+
 def length_of(result):
     return next(t.value for t in result.traits if t.name == "leaf_length")
 
 
-def test_only_the_leaf_that_is_meant_is_measured(crowded):
-    made, points, on_leaf = crowded
-    result = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
+def test_only_the_leaf_that_is_meant_is_measured(crowded, seeded):
+    made, points, _ = crowded
+    result = seeded
     assert length_of(result) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
     assert any("not of a seed point's leaf" in note for note in result.notes)
     assert len(result.reference) < len(points) - 1000
@@ -45,10 +52,10 @@ def test_only_the_leaf_that_is_meant_is_measured(crowded):
     assert length_of(result) == pytest.approx(length_of(alone), abs=LENGTH_CM)
 
 
-@pytest.mark.parametrize(("unit", "factor", "shift"), [("mm", 10.0, 0.0), ("m", 0.01, 0.0), ("mm", 10.0, 4e8)])
-def test_a_seed_point_is_in_the_unit_and_frame_of_the_cloud(crowded, unit, factor, shift):
+@pytest.mark.parametrize(("unit", "factor", "shift"), [("m", 0.01, 0.0), ("mm", 10.0, 4e8)])
+def test_a_seed_point_is_in_the_unit_and_frame_of_the_cloud(crowded, seeded, unit, factor, shift):
     made, points, on_leaf = crowded
-    in_cm = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
+    in_cm = seeded
     other = phytofit.fit(
         points * factor + shift, unit, up=made.pose[:3, 2], seed_point=on_leaf * factor + shift, threads=2
     )
@@ -98,10 +105,8 @@ def test_a_leaf_that_touches_or_is_beside_it_at_the_stem_is_flagged(turn, lower,
     assert told.others_touch == touches
 
 
-def test_what_touches_comes_with_the_result(crowded):
-    made, points, on_leaf = crowded
-    result = phytofit.fit(points, "cm", up=made.pose[:3, 2], seed_point=on_leaf, threads=2)
-    assert is_told_that_others_touch(result)
+def test_what_touches_comes_with_the_result(seeded):
+    assert is_told_that_others_touch(seeded)
 
 
 def test_of_a_leaf_that_is_fused_with_the_one_that_is_meant_most_is_left_out(crowded):
