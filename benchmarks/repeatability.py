@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from common import DATA, clouds, progress, read, run_parts
+from cut_leaves import rows_of as labelled_points
 
 import phytofit
 
@@ -167,13 +168,14 @@ def turntable() -> Found:
 
 def maize() -> Found:
     """The leaf in the middle of each of two plants, cut out by their labels."""
+    points, labels = labelled_points(DATA.parent / "label3dmaize" / "v-6-1-l-r.txt")
     chosen = {
-        "corn": (DATA.parent / "corn_leaf_area" / "01.ply", "m"),
-        "label3dmaize": (DATA.parent / "label3dmaize" / "v-6-1-l-r.txt", "mm"),
+        "corn": phytofit.read_cloud(DATA.parent / "corn_leaf_area" / "01.ply", "m"),
+        "label3dmaize": phytofit.from_points(points, "mm", labels=labels),
     }
     leaves = {}
-    for name, (path, unit) in chosen.items():
-        plant = phytofit.segment(phytofit.read_cloud(path, unit, label_name="label"), labelled=True)
+    for name, cloud in chosen.items():
+        plant = phytofit.segment(cloud, labelled=True)
         phytomers = plant.phytomers()
         leaves[f"{name} leaf {len(phytomers) // 2 + 1}"] = (phytomers[len(phytomers) // 2], plant.up)
     return leaves
