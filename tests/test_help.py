@@ -45,10 +45,11 @@ def test_help_imports_nothing_slow():
     assert all(f"phytofit {name} " in done.stdout.replace("-c ", "phytofit ") for name in COMMANDS)
 
 
+@pytest.mark.long  # and on a machine that does nothing else
 def test_help_takes_less_than_half_a_second():
-    """Of the processor; the least of three, since what else runs on the machine adds to it."""
+    """Of the processor; the least of five, since what else runs on the machine adds to it."""
     took = []
-    for _ in range(3):
+    for _ in range(5):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run([sys.executable, "-m", "phytofit", "fit", "--help"], stdout=subprocess.DEVNULL, check=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)

@@ -49,7 +49,7 @@ def results(fitted, segmented):
     made = Reconstruction(
         segmented.cloud, turned, turned + 1, camera, ("a.png",), eye, pairs=(), flags=(HOSTILE,), **nothing
     )
-    run = PlantRun(trait_table("plant", fitted.traits), segmented, (HOSTILE,), (), ())
+    run = PlantRun(trait_table("plant", fitted.traits), (segmented,), (HOSTILE,), (), ())
     return {"fit": fitted, "segmentation": segmented, "reconstruction": made, "run": run}
 
 
