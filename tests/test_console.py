@@ -103,7 +103,7 @@ def faulty(monkeypatch):
 def test_what_nobody_foresaw_is_one_line_and_the_log_has_the_details(faulty, tmp_path):
     line = one_line(run("simulate", "--out", tmp_path / "[out]"))
     log = tmp_path / "[out]" / "phytofit.log"
-    assert line == f"error: unforeseen: ZeroDivisionError: division by [/] zero; details are in {log}"
+    assert line == f"error: unexpected error: ZeroDivisionError: division by [/] zero; details are in {log}"
     assert "Traceback" in log.read_text()
     assert phytofit.__version__ in log.read_text().splitlines()[0]
     assert "Traceback" in run("simulate", "--verbose", "--out", tmp_path).stderr

@@ -62,7 +62,7 @@ def test_depths_beyond_the_stated_range_are_left_out_and_the_note_says_so(tmp_pa
     inside = (image() >= 700) & (image() <= 900)
     assert ((depth > 0) == inside).all()
     (note,) = notes
-    assert "beyond what the camera sees, 70 to 90 cm" in note
+    assert "outside the camera's range, 70 to 90 cm" in note
 
 
 def test_steps_of_a_tenth_of_a_millimetre(tmp_path):
@@ -104,7 +104,7 @@ def test_a_cloud_in_place_of_a_folder(tmp_path):
 @pytest.mark.parametrize(
     ("stored", "name", "said"),
     [
-        (np.zeros((24, 32, 3), np.uint8), "a.png", "a picture in colours .RGB.*photographs can't be measured"),
+        (np.zeros((24, 32, 3), np.uint8), "a.png", "a colour image .RGB.*photographs can't be measured"),
         (np.zeros((24, 32), np.uint8), "a.png", "an image of 8 bits"),
         (np.ones((12, 32), np.uint16), "a.png", "found 32 x 12 pixels, expected 32 x 24 of the camera small"),
         (np.ones((24, 32, 1), np.uint16), "a.npy", "an array of shape .24, 32, 1."),

@@ -112,7 +112,7 @@ def test_up_decides_the_direction(made, up):
     assert sign * told.pose[:3, 2] @ made.pose[:3, 2] > 0.9
     leaf_angle = told.parameters["leaf_angle"]
     assert leaf_angle < 90.0 if up == "known" else leaf_angle > 90.0
-    assert any("check up" in flag for flag in told.flags) == (up == "upside down")
+    assert any("check which way is up" in flag for flag in told.flags) == (up == "upside down")
 
 
 @pytest.mark.parametrize("method", ["paper", "likelihood"])

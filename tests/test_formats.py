@@ -77,7 +77,7 @@ def test_every_dialect_holds_the_same_points(folder: Path) -> None:
 def test_a_stated_unit_counts_more_than_the_files(tmp_path: Path) -> None:
     cloud = read_cloud(put(tmp_path / "a.csv", text(POINTS, ",", head="X [mm],Y [mm],Z [mm]\n")), "cm")
     np.testing.assert_array_equal(cloud.points, POINTS)
-    assert cloud.notes == ("the file says that its unit is mm, it was read in cm",)
+    assert cloud.notes == ("the file says that its unit is mm, but it was read in cm",)
     np.testing.assert_allclose(read_cloud(put(tmp_path / "a.las", las(POINTS)), "cm").points, POINTS, atol=1.1e-5)
 
 

@@ -152,7 +152,9 @@ def complaint(command, arguments):
     faults = {
         "raised": done.exception is not None and not isinstance(done.exception, SystemExit),
         "an exit code of its own": done.exit_code not in (0, 1, 2),
-        "a fault of the program": any(sign in done.output for sign in ("Traceback", "unforeseen", "fault of phytofit")),
+        "a fault of the program": any(
+            sign in done.output for sign in ("Traceback", "unexpected error", "internal error")
+        ),
         "an escape sequence": "\x1b" in done.output,
         "said nothing": done.exit_code > 0 and not errors,
         "said too much": max(map(len, errors), default=0) > MOST_CHARACTERS,

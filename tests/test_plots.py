@@ -145,7 +145,7 @@ def plant_of(seed, n_leaves, n_points, *, size=30.0, unit="cm", up=None):
         shares = random.random((n_points, 1))
         points.append(midrib[0] + shares * (midrib[-1] - midrib[0]))
         labels.append(np.full(n_points, rank + 1))
-        flags = ("collar next to another leaf's: their ranks may be exchanged",) if rank % 2 else ()
+        flags = ("collar next to another leaf's: their ranks may be swapped",) if rank % 2 else ()
         leaves.append(
             SegmentedLeaf(rank, 0.0, collar, size * rank, size * rank, midrib[-1], midrib, size, n_points, flags)
         )

@@ -208,7 +208,7 @@ class TestBadInput:
         ("image", "said"),
         [
             (np.zeros((264, 320), np.uint8), "view_1.png: found an image of 8 bits"),
-            (np.zeros((264, 320, 3), np.uint8), "view_1.png: found a picture in colours"),
+            (np.zeros((264, 320, 3), np.uint8), "view_1.png: found a colour image"),
             (
                 np.full((100, 90), 900, np.uint16),
                 "view_1.png: found 90 x 100 pixels, expected 320 x 264 of the camera test",

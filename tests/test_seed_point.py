@@ -46,7 +46,7 @@ def test_only_the_leaf_that_is_meant_is_measured(crowded, seeded):
     made, points, _ = crowded
     result = seeded
     assert length_of(result) == pytest.approx(55.0 - 1.5 / np.sin(np.deg2rad(50.0)), abs=LENGTH_CM)
-    assert any("not of a seed point's leaf" in note for note in result.notes)
+    assert any("not on the seed point's leaf" in note for note in result.notes)
     assert len(result.reference) < len(points) - 1000
     alone = phytofit.fit(made.points, "cm", up=made.pose[:3, 2], threads=2)
     assert length_of(result) == pytest.approx(length_of(alone), abs=LENGTH_CM)

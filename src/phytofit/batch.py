@@ -56,9 +56,9 @@ def each_cloud(
             except PhytofitError as error:
                 made = Outcome(path, name, None, _named(path, str(error)))
             except Exception as error:  # whatever it is, the others go on
-                LOG.exception("%s: a fault of phytofit", path)
+                LOG.exception("%s: an internal error of phytofit", path)
                 where = "" if log is None else f"; please report it with {log}"
-                reason = f"a fault of phytofit, {type(error).__name__}: {error}{where}"
+                reason = f"an internal error of phytofit, {type(error).__name__}: {error}{where}"
                 made = Outcome(path, name, None, _named(path, reason))
             if made.result is None:
                 failed[name] = (path, made.failure)

@@ -31,7 +31,10 @@ MUCH_ELSEWHERE = (
     0.12  # share of the points; phytomers have up to 0.04, with leaves of others or of no plant 0.2 and more
 )
 SPARSE = 0.4  # of the leaf's density of points; a stem seen from one side has half
-NO_STEM = "no stem in this cloud: what looks most like one has {:.0f} points that may as well be the leaf's"
+NO_STEM = (
+    "no stem in this cloud: the {:.0f} points that look most like one may belong to the leaf; keep some stem below the "
+    "leaf"
+)
 MORE_THAN_ONE_LEAF = "{:.0f} % of the points lie on surfaces that are neither the fitted stem nor the fitted leaf"
 INTERVAL_METHOD = "sandwich interval"
 OPEN_WITHOUT_TIP = ("leaf_length", "leaf_area")  # no upper end where the tip was not seen
@@ -237,7 +240,7 @@ def remarked(result: Fit, *, labelled: bool = False) -> Fit:
             text = MORE_THAN_ONE_LEAF.format(100.0 * made.sighting.elsewhere)
             if result.settings.get("seed_point") is None:
                 raise NoPhytomerError(f"this looks like a whole plant, or more than one leaf: {text}; {ONE_LEAF_ONLY}")
-            flags.append(f"{UNUSABLE}{text}")
+            flags.append(f"{UNUSABLE}{text}. Cut the other leaves away")
     flags += flags_of(
         result.species.space,
         result.x,

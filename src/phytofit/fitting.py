@@ -29,11 +29,11 @@ __all__ = ["METHODS", "fit", "mean_at"]
 FloatArray = NDArray[np.float64]
 N_SEARCHED = 7  # those and the stem above the leaf
 SEARCH = ("n_samples", "n_generations", "elite_fraction", "covariance_noise")
-DITHERED = f"the points had no noise: {DITHER_CM:g} cm was added, without which the likelihood can't be climbed"
+DITHERED = f"the points had no noise: {DITHER_CM:g} cm was added, because the fit needs some"
 LEAST_ALIKE = 0.5  # of the stem's parts above and below a leaf, shorter over longer: half-way from "none" to "equal"
 PLAUSIBLE_LEAD = 4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
-UP_DOUBTFUL = "with the stated up the leaf points down or bends up: check up"
-UP_UNKNOWN = "this leaf does not show which way is up: leaf angle may be 180° minus this. State up if it is known"
+UP_DOUBTFUL = "with the stated up, the leaf points down or bends upwards: check which way is up"
+UP_UNKNOWN = "this leaf does not show which way is up: leaf angle may be 180° minus this value. State up if it is known"
 
 
 def fit(

@@ -117,7 +117,7 @@ def _check_near(gap: FloatArray) -> None:
     if np.any(gap > NEAREST_CM):
         raise SettingError(
             f"seed_point: expected a point within {NEAREST_CM:g} cm of a leaf's, in the unit of the cloud; "
-            f"the nearest to number {np.argmax(gap) + 1} of {len(gap)} is {gap.max():.1f} cm away"
+            f"seed point {np.argmax(gap) + 1} of {len(gap)} is {gap.max():.1f} cm from the nearest one"
         )
 
 

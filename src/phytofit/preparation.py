@@ -75,7 +75,7 @@ def prepare(
         told, others_touch = meant_points(cloud.points / scale, seed_points / scale, find_starts)
         meant = cloud.take(np.flatnonzero(told))
         found = prepare(meant, species, n_points=n_points, up=up, with_outliers=with_outliers)
-        left_out = f"{len(cloud) - len(meant)} of {len(cloud)} points left out: not of a seed point's leaf"
+        left_out = f"{len(cloud) - len(meant)} of {len(cloud)} points left out: not on the seed point's leaf"
         flags = (OTHERS_TOUCH, *found.flags) if others_touch else found.flags
         return replace(found, notes=(left_out, *found.notes), flags=flags)
     if cloud.labels is not None:

@@ -225,7 +225,7 @@ def unforeseen(error: Exception) -> str:
     logs = [handler.baseFilename for handler in LOG.handlers if isinstance(handler, logging.FileHandler)]
     ours = [log for log in logs if Path(log).name == "phytofit.log"]
     where = f"details are in {ours[0]}" if ours else "--verbose shows details"
-    return f"unforeseen: {type(error).__name__}: {error or 'no more is known'}; {where}"
+    return f"unexpected error: {type(error).__name__}: {error or 'no details'}; {where}"
 
 
 def complain(error: Exception | str) -> None:

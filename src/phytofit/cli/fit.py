@@ -73,7 +73,7 @@ def fit_command(
         str,
         choice(
             "likelihood: the most probable phytomer, with 95 % intervals. "
-            "paper: the search of Sodhi et al., IROS 2018, for the least distance.",
+            "paper: the search of Sodhi et al., IROS 2018, which minimises a distance.",
             among=[*METHODS],
         ),
     ] = FIT["method"],
@@ -93,8 +93,8 @@ def fit_command(
     points: Annotated[
         int | None,
         numeric(
-            f"Points to which the cloud is thinned; by default {_by_method('n_points')}, which also gives each "
-            "candidate so many.",
+            f"Points to which the cloud is thinned; by default {_by_method('n_points')}; for paper, also the "
+            "number of points on each candidate.",
             least=1,
             most=MOST_POINTS,
         ),

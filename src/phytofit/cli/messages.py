@@ -45,7 +45,6 @@ ADVICE = {  # of the library, and the option that follows it
     r"\b[Ss]tate up\b": "--up",
     r"\bname the property\b": "--labels",
     r"\bgive a seed point\b": "--seed-point",
-    r"\bthis looks like a whole plant\b": "phytofit run measures it",
 }
 
 
@@ -57,7 +56,8 @@ def at_command_line(said: object) -> str:
         text = f"--{ARGUMENTS[beginning[1]]}{text[beginning.end() :]}"
     for advice, option in ADVICE.items():
         text = re.sub(advice, rf"\g<0> ({option})", text)
-    return text
+    text = re.sub(r"\bstem_above='(\w+)'", r"--stem-above \1", text)
+    return text.replace("phytofit.run", "phytofit run")
 
 
 def of_usage(error: typer.TyperException) -> str:

@@ -117,7 +117,7 @@ UnitsOption = Annotated[
     str | None,
     choice(
         f"Unit of the coordinates: {', '.join(UNITS[:-1])}; or {UNITS[-1]}, for lengths relative to each other. "
-        "Only LAS, LAZ and E57 files say it themselves (m).",
+        "Required, except for LAS, LAZ and E57, which are in metres.",
         "--units",
         "-u",
         among=UNITS,
@@ -140,12 +140,15 @@ OutOption = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Fol
 NoiseOption = Annotated[float, numeric("Standard deviation of the noise of each coordinate, cm.", least=0)]
 NoiseReachOption = Annotated[
     float,
-    numeric("How far neighbours share their noise, as in fused and stereo clouds, cm; 0: independent.", least=0),
+    numeric(
+        "Distance over which neighbouring points share noise, cm, as in fused and stereo clouds; 0: independent.",
+        least=0,
+    ),
 ]
 ViewsOption = Annotated[
     int | None,
     numeric(
-        "Cameras around the plant, which see what is not hidden; by default it is seen from everywhere.",
+        "Cameras around the plant, each seeing only what is not hidden; by default every surface is seen.",
         least=1,
         most=1000,
     ),

@@ -84,8 +84,8 @@ def run_command(
     """Measure all leaves of a plant, from depth images or from its cloud: reconstruct, segment, fit.
 
     Writes DIR/plant.png (look at it first: leaves coloured and numbered, beside their traits), DIR/traits.csv (plant,
-    internodes and leaves), and what each stage made: DIR/reconstruction, DIR/segmentation, DIR/leaves/leaf_01 and on;
-    for several plants, all that in DIR/NAME, and DIR/traits.csv over all. A stage that is up to date is not done again.
+    internodes and leaves), and what each stage made: DIR/reconstruction, DIR/segmentation, DIR/leaves/leaf_01, …; for
+    several plants, all that in DIR/NAME, and DIR/traits.csv over all. Stages that are up to date are skipped.
     Where a leaf is wrong, edit the labels in DIR/segmentation/plant.ply and run on that file with --labels label.
 
     Examples:
@@ -198,7 +198,7 @@ def _print_plant(made: "PlantRun") -> None:
         show(table)
     print_remarks(made.notes, made.flags)
     if made.skipped:
-        say(f"up to date, not done again: {', '.join(made.skipped)}")
+        say(f"up to date, skipped: {', '.join(made.skipped)}")
 
 
 def _with_interval(traits: "pd.DataFrame", name: str) -> str:

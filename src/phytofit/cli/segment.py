@@ -35,10 +35,10 @@ def segment_command(
     labels: LabelsOption = None,
     folder: OutOption = Path("plants"),
 ) -> None:
-    """Take plants apart: stem, leaves numbered from the base, and a cloud of each leaf with its piece of stem.
+    """Separate plants into stem and leaves, numbered from the base; cut out each leaf with its piece of stem.
 
     Writes, for each cloud, DIR/NAME/ with segmentation.png (look at it first), leaves.csv, plant.ply (all points with
-    their labels: 0 none, 1 stem, 2.. leaves) and phytomers/leaf_01.ply and on, ready for phytofit fit; and
+    their labels: 0 no organ, 1 stem, 2 and up leaves) and phytomers/leaf_01.ply, …, ready for phytofit fit; and
     DIR/leaves.csv over all. Where a cloud holds several plants, each gets its folder, DIR/NAME/plant_1 and on. Where a
     leaf is wrong, edit the labels in plant.ply and give it back with --labels label.
 
@@ -65,7 +65,7 @@ def segment_command(
 
     with results_in(folder):
         print_skipped(skipped)
-        done = f"clouds taken apart: {folder / 'leaves.csv'}"
+        done = f"clouds segmented: {folder / 'leaves.csv'}"
         measure_each(files, folder, taken_apart, leaf_tables, _print_plants, done)
 
 

@@ -60,11 +60,11 @@ def validate_command(
         ),
     ] = None,
     simulated: Annotated[
-        bool, typer.Option("--simulate", help="No results: simulated phytomers, seen by a sensor such as yours.")
+        bool, typer.Option("--simulate", help="Simulate phytomers and your sensor instead of reading results.")
     ] = False,
-    points: Annotated[int, numeric("Points your sensor gives of a phytomer.", least=1, most=MOST_POINTS)] = SIMULATE[
-        "n_points"
-    ],
+    points: Annotated[
+        int, numeric("Number of points that your sensor records on a phytomer.", least=1, most=MOST_POINTS)
+    ] = SIMULATE["n_points"],
     noise: NoiseOption = SIMULATE["noise_cm"],
     noise_reach: NoiseReachOption = SIMULATE["noise_reach_cm"],
     views: ViewsOption = SIMULATE["n_views"],
@@ -81,7 +81,7 @@ def validate_command(
     threads: ThreadsOption = None,
     folder: OutOption = Path("validation"),
 ) -> None:
-    """How good are the numbers: against your ruler, or in a simulation of your sensor.
+    """Compare results with hand measures, or predict how accurate your sensor would be.
 
     With --truth: results beside hand measures; bias, errors, correlation, concordance, limits of agreement, coverage.
     With --simulate: phytomers drawn from the species' ranges, scanned with your noise, points, cameras and occlusion,

@@ -193,7 +193,7 @@ def _few_digits(called: str, xyz: NDArray[np.float64], step: NDArray[np.float64]
     cause = " (map coordinates in single precision)" if is_map else ""
     advice = "subtract an offset before the export, or write doubles" if is_map else "export it with more digits"
     if n_places < MIN_POINTS or step.max() > TOO_COARSE * size_cm(xyz):
-        raise CloudError(f"{called}: {steps}{cause}, which leaves {n_places} places for {len(xyz)} points; {advice}")
+        raise CloudError(f"{called}: {steps}{cause}, so that {len(xyz)} points share {n_places} positions; {advice}")
     return f"{steps}{cause}: digits are missing; {advice}"
 
 

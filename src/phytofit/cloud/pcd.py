@@ -91,4 +91,4 @@ def _of_bytes(body: bytes, header: _Header) -> list[tuple[str, NDArray[Any]]]:
 
 def _check_whole(header: _Header, is_whole: bool) -> None:
     if not is_whole or header.n_points <= 0:
-        raise FileError(f"truncated: it declares {header.n_points} points, that is not what follows; copy it again")
+        raise FileError(f"truncated: it declares {header.n_points} points, but another number follows; copy it again")

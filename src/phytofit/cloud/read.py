@@ -28,7 +28,7 @@ READERS = {
     **dict.fromkeys((".xyz", ".txt", ".csv", ".pts", ".asc"), "columns"),
 }
 """By suffix the module whose ``read`` makes a Table of bytes and of the keys of the columns wanted."""
-OTHER_UNIT = "the file says that its unit is {}, it was read in {}"
+OTHER_UNIT = "the file says that its unit is {}, but it was read in {}"
 
 
 def read_cloud(

@@ -194,7 +194,7 @@ def _usable(images: Sequence[DepthView], camera: Camera) -> Views:
     )
     first = [next(j for j in range(i + 1) if np.array_equal(d, views.depths[j])) for i, d in enumerate(views.depths)]
     names = [views.files[j] for j in first]
-    views.keep([j == i for i, j in enumerate(first)], lambda i: f"doubled: the same image as {names[i]}")
+    views.keep([j == i for i, j in enumerate(first)], lambda i: f"duplicate of {names[i]}")
     views.depths = [drop_flying_pixels(depth, camera) for depth in views.depths]
     return views
 
@@ -232,7 +232,7 @@ def _fused(
         spacing_cm=spacing,
     )
     if fused.contradicted > DOUBTFUL:
-        said = f"{100 * fused.contradicted:.0f} % of the points are seen through by other views, expected a few"
+        said = f"other views see through {100 * fused.contradicted:.0f} % of the points, expected a few"
         asked = f"is the camera ({camera.name}, f = {camera.fx:g} pixels) right, and did the leaves keep still?"
         if fused.contradicted > REFUSED:
             raise InputError(f"{folder}: the views don't fit each other: {said}; {asked}")

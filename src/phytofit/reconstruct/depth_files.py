@@ -124,10 +124,10 @@ def read_views(
     n_pixels = len(files) * camera.width * camera.height
     notes = []
     if n_full:
-        notes.append(f"{_percent(n_full, n_pixels)} of the pixels hold the largest value there is: nothing came back")
+        notes.append(f"{_percent(n_full, n_pixels)} of the pixels hold the largest possible value: no return")
     if n_beyond:
         seen = f"{low:g} to {high:g} cm"
-        notes.append(f"{_percent(n_beyond, n_pixels)} of the pixels are left out: beyond what the camera sees, {seen}")
+        notes.append(f"{_percent(n_beyond, n_pixels)} of the pixels are left out: outside the camera's range, {seen}")
     return [DepthView(path.name, depth) for path, depth in zip(files, depths, strict=True)], tuple(notes)
 
 
@@ -159,7 +159,7 @@ def _read_image(path: Path, camera: Camera) -> NDArray[Any]:
             )
         if opened.mode not in DEEP_MODES:
             raise InputError(
-                f"{path.name}: found a picture in colours ({opened.mode}), expected distances of 16 bits; choose the "
+                f"{path.name}: found a colour image ({opened.mode}), expected 16-bit distances; choose the "
                 f"depth images by their names, if there are any; {PHOTOGRAPHS}"
             )
         _check_size(path, opened.size, camera)

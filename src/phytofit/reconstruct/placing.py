@@ -196,7 +196,7 @@ def place_by_poses(
     """
     if not views.files:
         raise InputError("no usable view: " + "; ".join(f"{r.file}: {r.reason}" for r in views.rejected))
-    progress("what is the plant")
+    progress("finding the plant")
     rays = camera.rays()
     poses = np.stack([given[file] for file in views.files])
     focus, reach = _focus(poses, views.depths, rays)

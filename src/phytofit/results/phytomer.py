@@ -80,7 +80,7 @@ def _check_finite(result: Fit) -> None:
     ends = [(t.name, end) for t in result.traits for end in (t.value, t.low, t.high) if end is not None]
     for what, value in (*ends, *result.parameters.items(), ("error", result.error)):
         if not np.isfinite(value):
-            raise NoPhytomerError(f"its {what.replace('_', ' ')} came out as {value}, not as a number: see its points")
+            raise NoPhytomerError(f"its {what.replace('_', ' ')} came out as {value}, not a number: look at the cloud")
 
 
 def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:

@@ -209,7 +209,7 @@ def _segmented(cloud: PointCloud, direction: FloatArray | None, n_nodes: int, *,
         given = leaf_names(cloud)
         strays = np.count_nonzero((cloud.labels > 1) & ~np.isin(cloud.labels, given))
         if strays:
-            notes.append(f"{strays} points whose label few others have were left out")
+            notes.append(f"{strays} points left out: too few share their label")
         table = dict(zip(given.tolist(), ranked[2:].tolist(), strict=True)) | {1: 1}
         labels = np.array([table.get(v, 0) for v in np.unique(cloud.labels).tolist()], np.int64)[
             np.unique(cloud.labels, return_inverse=True)[1]
