@@ -187,7 +187,10 @@ def load_camera(name: str) -> Camera:
         read = _File.model_validate(given).model_dump(exclude_none=True)
     except (ValidationError, OverflowError) as error:
         raise SettingError(f"{path}: {_first(error)}; expected {EXPECTED}") from None
-    return Camera(**{**read, "distortion": tuple(read["distortion"])}, name=path.stem)
+    try:
+        return Camera(**{**read, "distortion": tuple(read["distortion"])}, name=path.stem)
+    except SettingError as error:
+        raise SettingError(f"{path}: {error}") from None
 
 
 def _first(error: ValidationError | OverflowError) -> str:

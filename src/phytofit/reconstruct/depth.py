@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from phytofit.cloud import MIN_POINTS, SCALE_CM, PointCloud
 from phytofit.display import Shown, Summary
 from phytofit.errors import InputError, SettingError
-from phytofit.reconstruct.cameras import Camera, load_camera
+from phytofit.reconstruct.cameras import MOST, Camera, load_camera
 from phytofit.reconstruct.depth_files import DepthView, depth_files, read_views
 from phytofit.reconstruct.fusion import fuse
 from phytofit.reconstruct.placing import Placed, Rejected, Views, place_by_poses, place_on_turntable
@@ -172,7 +172,7 @@ def read_poses(path: Path, files: Sequence[str]) -> dict[str, FloatArray]:
         if name not in read:
             raise InputError(f"{path}: no pose for {name}, found {len(read)} poses; name each image file once")
         pose = read[name]
-        rigid = pose.shape == (4, 4) and bool(np.isfinite(pose).all()) and np.allclose(pose[3], [0, 0, 0, 1])
+        rigid = pose.shape == (4, 4) and bool((np.abs(pose) <= MOST).all()) and np.allclose(pose[3], [0, 0, 0, 1])
         R = pose[:3, :3] if rigid else np.zeros((3, 3))
         if not (np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0):
             raise InputError(
