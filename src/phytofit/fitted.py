@@ -27,9 +27,7 @@ __all__ = ["Fit", "beside_its_rival", "remarked"]
 FloatArray = NDArray[np.float64]
 LEAST_ON_STEM = 10.0  # points; with fewer it is no stem
 THIN = 2.0  # spreads of the prior, by which a stem is thinner than expected
-MUCH_ELSEWHERE = (
-    0.12  # share of the points; phytomers have up to 0.04, with leaves of others or of no plant 0.2 and more
-)
+MUCH_ELSEWHERE = 0.12  # share of the points; phytomers have up to 0.04, other clouds mostly 0.15 and more
 SPARSE = 0.4  # of the leaf's density of points; a stem seen from one side has half
 NO_STEM = (
     "no stem in this cloud: the {:.0f} points that look most like one may belong to the leaf; keep some stem below the "
