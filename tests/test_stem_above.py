@@ -82,7 +82,7 @@ def test_stated_up_decides_between_the_twins(made, method):
     assert over.pose[:3, 2] @ made.pose[:3, 2] < -0.98
     assert over.parameters["leaf_angle"] == pytest.approx(130.0, abs=10.0)
     assert values(over.organs)["leaf_length"] == pytest.approx(values(made.organs)["leaf_length"], abs=6.0)
-    assert any("is the stated up right?" in flag for flag in over.flags)
+    assert any("check which way is up" in flag for flag in over.flags)
 
 
 @pytest.mark.parametrize(

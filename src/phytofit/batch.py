@@ -7,6 +7,7 @@ from typing import Generic, TypeVar
 
 from phytofit.errors import OutputError, PhytofitError, SettingError
 from phytofit.results import LOG, FolderTable, open_log, prepare_folder, result_names, write_failures, write_workbook
+from phytofit.text import one_line
 
 __all__ = ["Outcome", "each_cloud"]
 
@@ -48,7 +49,7 @@ def each_cloud(
         for i, (path, name) in enumerate(zip(paths, result_names(paths), strict=True)):
             try:
                 made = Outcome(path, name, measured(path, name))
-                LOG.info("%s: measured, see %s", path, folder / name)
+                LOG.info("%s: measured, see %s", one_line(path), one_line(folder / name))
             except SettingError as error:
                 if i == len(failed):
                     raise
@@ -56,13 +57,13 @@ def each_cloud(
             except PhytofitError as error:
                 made = Outcome(path, name, None, _named(path, str(error)))
             except Exception as error:  # whatever it is, the others go on
-                LOG.exception("%s: an internal error of phytofit", path)
+                LOG.exception("%s: an internal error of phytofit", one_line(path))
                 where = "" if log is None else f"; please report it with {log}"
                 reason = f"an internal error of phytofit, {type(error).__name__}: {error}{where}"
                 made = Outcome(path, name, None, _named(path, reason))
             if made.result is None:
                 failed[name] = (path, made.failure)
-                LOG.warning("%s", made.failure)
+                LOG.warning("%s", one_line(made.failure))
             unwritten = _tables(folder, over_all, failed, paths[: i + 1])
             yield made
     if unwritten is not None:
@@ -79,7 +80,7 @@ def _tables(
         over_all.write()
         write_failures(folder, failed, tried)
     except OutputError as error:
-        LOG.warning("%s", error)
+        LOG.warning("%s", one_line(error))
         return error
     return None
 

@@ -327,7 +327,7 @@ def _fitted(
         except PhytofitError:
             raise
         except Exception as error:  # whatever it is, the other leaves go on
-            LOG.exception("%s: an internal error of phytofit", name)
+            LOG.exception("%s: an internal error of phytofit", one_line(name))
             reason = f"an internal error of phytofit, {type(error).__name__}: {one_line(error)}"
             _save_by_points(plant, leaf, reason, target, key_of(name, [], {"fault": reason}))  # to be tried again
     table = read_table(target / "traits.csv")

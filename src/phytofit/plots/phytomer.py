@@ -44,6 +44,7 @@ TABLE_IN = 3.4  # width of the table and of what stands below it
 COLUMNS_IN = (1.2, 1.05, 1.15)
 HIGHEST_IN = 7.0  # of the views
 DOTTED = 0.35  # dots, as a share of the room that the cloud takes up: the model is seen behind them
+LEAST_LENGTH = 1e-9  # of the midrib, outside the stem: less is rounding
 ARC_IN = 0.4  # radius of the angle's arc
 STEEPEST_DEG = 60.0  # of the view onto the blade: from higher up it would not show which way is up
 MOST_LINES = 4  # of a remark
@@ -169,7 +170,7 @@ def _draw_measures(side: Panel, facing: Panel, result: Fit, traits: dict[str, Tr
     stem, leaf = result.organs
     start = leaves_stem_at(stem, leaf)
     whole = float(leaf.segment_lengths.sum())
-    if not 0.0 <= start < whole:
+    if not 0.0 <= start < whole * (1.0 - LEAST_LENGTH):
         return
     at = np.concatenate([[0.0], np.cumsum(leaf.segment_lengths)])
     collar = _on(leaf, at, start)
