@@ -87,8 +87,8 @@ ERRORS = [
     ("a.ply", ASCII_PLY[:-200] + b"x" + ASCII_PLY[-200:], "a.ply: found '"),
     # PCD
     ("a.pcd", pcd_header("ascii"), "a.pcd: truncated: it declares 120 points, but another number follows; copy it"),
-    ("a.pcd", pcd_header("binary") + 500 * "x", "a.pcd: truncated: it declares 120 points, that is not what follo"),
-    ("a.pcd", pcd_header("binary_compressed") + "abc", "a.pcd: truncated: it declares 120 points, that is not"),
+    ("a.pcd", pcd_header("binary") + 500 * "x", "a.pcd: truncated: it declares 120 points, but another number follo"),
+    ("a.pcd", pcd_header("binary_compressed") + "abc", "a.pcd: truncated: it declares 120 points, but another"),
     ("a.pcd", pcd_header("binary")[:70], "a.pcd: not a PCD file, or truncated: starts with 'VERSION"),
     ("a.pcd", "FIELDS x\nDATA ascii\n1\n", "a.pcd: its PCD header holds 'FIELDS', expected FIELDS, SIZE, TYPE"),
     (

@@ -313,7 +313,7 @@ def test_map_coordinates_in_single_precision_say_what_is_missing() -> None:
     with pytest.warns(UserWarning, match=note):
         from_points((leaf(3000) / 100 + corner).astype(np.float32), "m")
     refused = (
-        r"^cloud: coordinates are in steps of 0.5 m .*, which leaves \d+ places for 3000 points; subtract an offset"
+        r"^cloud: coordinates are in steps of 0.5 m .*, so that 3000 points share \d+ positions; subtract an offset"
     )
     with pytest.raises(CloudError, match=refused):
         from_points((leaf(3000) / 100 + 10 * corner).astype(np.float32), "m")

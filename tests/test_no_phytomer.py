@@ -85,7 +85,7 @@ def test_what_is_no_phytomer_is_refused_with_a_plain_sentence(made, kind):
         phytofit.fit(cloud, threads=2)
     assert "--" not in str(refused.value)
     if kind in SENTENCE:
-        assert "use phytofit.run for a whole plant, or give a seed point" in str(refused.value)
+        assert "measure a whole plant with phytofit.run, or give a seed point" in str(refused.value)
 
 
 def test_a_phytomer_among_outliers_and_without_a_piece_is_measured(made):

@@ -150,7 +150,7 @@ class TestTurntable:
         rejected = {view.file: view.reason for view in found.rejected}
         assert list(rejected) == ["view_9.png", "view_13.png", "view_10.png"]
         assert "empty" in rejected["view_9.png"]
-        assert "same image as view_11.png" in rejected["view_13.png"]
+        assert "duplicate of view_11.png" in rejected["view_13.png"]
         assert "does not fit the others" in rejected["view_10.png"]
         assert len(found.flags) == 2
         assert "view_4.png: turned 6" in found.flags[0]

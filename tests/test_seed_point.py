@@ -201,7 +201,9 @@ def test_what_is_no_point_is_refused(crowded, wrong):
 
 
 def test_a_point_far_from_every_leaf_is_refused(crowded):
-    with pytest.raises(phytofit.SettingError, match=r"in the unit of the cloud; the nearest .* cm away"):
+    with pytest.raises(
+        phytofit.SettingError, match=r"in the unit of the cloud; seed point 1 of 1 is .* cm from the nearest one"
+    ):
         phytofit.fit(crowded[0].points, "cm", seed_point=[500.0, 0.0, 0.0])
 
 
