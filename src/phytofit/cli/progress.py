@@ -14,8 +14,8 @@ from phytofit.text import one_line
 __all__ = ["Items", "Told"]
 
 Told = Callable[[str, float], None]
-QUICK_S = 2.0  # what takes no longer is not told in stages
-SURE = 0.05  # share of the work after which the time that is left can be told
+QUICK_S = 2.0  # what takes no longer shows no stages
+SURE = 0.05  # share of the work after which the time left is shown
 
 
 class Items:

@@ -1,4 +1,4 @@
-"""Files of results: their names, which do not collide, and what stands in them."""
+"""Files of results: their names, which do not collide, and what they hold."""
 
 import hashlib
 import itertools

@@ -104,7 +104,7 @@ def _label(cloud: str | None, row: Row) -> str:
 
 
 def _repeated(found: Mapping[tuple[str, str], tuple[Row, Sequence[float]]]) -> Iterator[str]:
-    """A note on each trait of which some were measured more than once."""
+    """A note on each trait with repeated measures."""
     for trait in dict.fromkeys(trait for _, trait in found):
         mine = {label: (r["unit"], values) for (label, t), (r, values) in found.items() if t == trait}
         again = {label: (unit, np.array(values)) for label, (unit, values) in mine.items() if len(values) > 1}
