@@ -35,6 +35,7 @@ bench: install
 
 bench-accuracy: install
 	$(BIN)/python benchmarks/trust.py
+	$(BIN)/python benchmarks/foreign.py
 	$(BIN)/python benchmarks/robustness.py
 	$(BIN)/python benchmarks/evidence.py
 	$(BIN)/python benchmarks/leaf_ends.py

@@ -311,3 +311,38 @@ def test_robustness_benchmark_measures_each_step():
         outcome = robustness.measured(robustness.Job(name, sweep.steps[0], 0, True))
         assert outcome.found, name
         assert np.all(np.isfinite(outcome.peers)), name
+
+
+def test_a_foreign_leaf_has_the_truth_of_its_surface():
+    foreign_leaves = load("foreign_leaves")
+    surface, truth = foreign_leaves.phytomer(np.random.default_rng(3))
+    stem = surface.points[surface.organ == foreign_leaves.STEM]
+    blade = surface.points[surface.organ == foreign_leaves.BLADE]
+    middle = blade.reshape(foreign_leaves.N_ALONG - 1, foreign_leaves.N_ACROSS - 1, 3)[:, 39:41].mean(axis=1)
+    along = np.linalg.norm(np.diff(middle, axis=0), axis=1).sum()
+    assert truth["leaf_length"] == pytest.approx(along, rel=0.005)
+    across = blade.reshape(foreign_leaves.N_ALONG - 1, -1, 3)
+    widest = np.linalg.norm(np.diff(across, axis=1), axis=2).sum(1).max() * 80 / 79
+    assert truth["leaf_width"] == pytest.approx(widest, rel=0.005)
+    below = stem[stem[:, 2] < blade[:, 2].min()]
+    hull = [
+        np.ptp(below[np.abs(below[:, 2] - z) < 0.2, :2], axis=0).mean() for z in np.linspace(1, below[:, 2].max(), 9)
+    ]
+    assert truth["stem_diameter"] == pytest.approx(np.mean(hull), rel=0.06)  # its axes may lie askew
+
+
+def test_a_foreign_cloud_lies_on_its_surface_and_comes_back():
+    foreign, foreign_leaves = load("foreign"), load("foreign_leaves")
+    surface, _ = foreign_leaves.phytomer(np.random.default_rng(5))
+    still = foreign.Camera(90.0, 0.2, 0.0, 0.0, 2.0, 0.0, 0.1, 0.0, 0.0)
+    seen = foreign.seen_by(still, 3, surface, np.random.default_rng(6))
+    assert cKDTree(surface.points).query(seen)[0].max() < 0.1
+    assert len(seen) > 1000
+    again = [foreign.cloud(2, on_grid=True)[0] for _ in range(2)]
+    np.testing.assert_array_equal(*again)
+
+
+@pytest.mark.long
+def test_foreign_benchmark_runs():
+    said = run("foreign.py", "grid", "--leaves", "2")
+    assert "leaf_insertion_angle" in said
