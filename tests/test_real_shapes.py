@@ -129,7 +129,10 @@ def rising(seed, along_cm, length=50.0, radius=1.2, noise_cm=0.3):
     return phytofit.simulation.add_noise(points, noise_cm, np.random.default_rng(seed)), length
 
 
-@pytest.mark.parametrize("shape", [{"leaf_base_bend": 30.0}, {"leaf_rotate_angle": 4.5, "leaf_bow": -8.0}])
+@pytest.mark.parametrize(
+    "shape",
+    [{"leaf_base_bend": 30.0}, pytest.param({"leaf_rotate_angle": 4.5, "leaf_bow": -8.0}, marks=pytest.mark.long)],
+)
 def test_a_leaf_that_rises_along_its_stem_is_measured_from_its_collar(shape):
     """Where it leaves the surface turns on a millimetre: taken a little too thick, the stem hides two centimetres."""
     off = []
@@ -284,9 +287,10 @@ def test_holes_hardly_widen_a_blade_and_many_are_flagged(nodes, radius, flagged)
 OWN = {"leaf_bow": 15.0, "leaf_side_bend": -20.0, "leaf_base_width": 0.5, "leaf_taper": 1.5, "leaf_twist": 30.0}
 
 
-def test_a_sparse_leaf_is_followed_to_its_tip_and_flagged():
+@pytest.mark.parametrize("n_leaves", [3, pytest.param(7, marks=pytest.mark.long)])
+def test_a_sparse_leaf_is_followed_to_its_tip_and_flagged(n_leaves):
     """Some 150 points on it: the last of them are few, and far from what a short leaf would have."""
-    results = [fitted(grown(seed=seed, n_points=260, **OWN)) for seed in range(1, 8)]
+    results = [fitted(grown(seed=seed, n_points=260, **OWN)) for seed in range(1, 1 + n_leaves)]
     for result in results:
         assert len(result.x) > 7
         assert result.estimate.noise[1] > 0.1
@@ -395,16 +399,22 @@ def wavy(seed=1, n_points=4000, radius=1.2, noise_cm=0.25, along_deg=8.0, ragged
     return phytofit.simulation.add_noise(points, noise_cm, np.random.default_rng(seed)), organs
 
 
-@pytest.mark.parametrize("on_stem", [0.0, 0.6])
-def test_misfit_does_not_speak_for_the_poorer_model(on_stem, monkeypatch):
-    """Where errors are correlated on stem and leaf alike, they are the sensor's: points count for few, and a model
-    that fits a little better is not believed.  Where the stem's are not, the leaf's are misfit, of which the richer
-    leaf has less."""
+@pytest.fixture(scope="module")
+def wavy_ends():
+    """A wavy leaf's points, and where the models of its leaf end."""
     points, _ = wavy()
     plain = SPECIES.leading(7)
     upright = np.array([1.2, 15.0, 30.0, 60.0, 5.0, 3.0, 10.0])
     start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(upright, np.eye(4), 2.0)
-    ends = posterior._candidates(plain, SPECIES, Cloud(points, None, None), start)
+    return points, posterior._candidates(plain, SPECIES, Cloud(points, None, None), start)
+
+
+@pytest.mark.parametrize("on_stem", [0.0, 0.6])
+def test_misfit_does_not_speak_for_the_poorer_model(on_stem, monkeypatch, wavy_ends):
+    """Where errors are correlated on stem and leaf alike, they are the sensor's: points count for few, and a model
+    that fits a little better is not believed.  Where the stem's are not, the leaf's are misfit, of which the richer
+    leaf has less."""
+    points, ends = wavy_ends
     gain = ends[2].fit_of_points - ends[0].fit_of_points
     assert gain > 300.0
 
