@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import phytofit
+from phytofit import fitting
 from phytofit.cli import app
 from test_segmentation import cloud_of, plant
 
@@ -118,3 +119,18 @@ def test_two_maize_plants_25_cm_apart():
     assert sorted(len(one) for one in found) == [2500, 2500]
     assert (told_apart(found, parts) == 1.0).all()
     assert [len(phytofit.segment(one).leaves) >= 3 for one in found] == [True, True]
+
+
+@pytest.mark.skipif(not TWO.exists(), reason="no data in ../shared/data")
+def test_a_fit_of_two_plants_is_refused_for_what_it_is(monkeypatch):
+    """Whatever the fit stumbled over: two plants are the cause."""
+
+    def stumbles(*of, **how):
+        raise phytofit.NoPhytomerError("no stem in this cloud")
+
+    monkeypatch.setattr(fitting, "_fit", stumbles)
+    cloud = phytofit.read_cloud(TWO, "mm")
+    with pytest.raises(phytofit.NoPhytomerError, match=r"^this looks like 2 plants: .*phytofit\.run"):
+        phytofit.fit(cloud)
+    with pytest.raises(phytofit.NoPhytomerError, match="no stem in this cloud"):
+        phytofit.fit(phytofit.separate_plants(cloud)[0])

@@ -3,7 +3,7 @@
 import inspect
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -14,14 +14,16 @@ from threadpoolctl import threadpool_limits
 
 from phytofit.cloud import PointCloud, as_cloud
 from phytofit.distances import DISTANCES, Reference
-from phytofit.errors import SettingError, Status
+from phytofit.errors import NoPhytomerError, SettingError, Status
 from phytofit.fitted import Fit, beside_its_rival, remarked
+from phytofit.flags import ONE_LEAF_ONLY
 from phytofit.objectives import PaperObjective, minimise
 from phytofit.optimize import CrossEntropy, Generation
 from phytofit.parsing import checked_flag, checked_number, checked_whole, parse_points, parse_up
 from phytofit.pose import StartPose, parts_of_stem
 from phytofit.posterior import DITHER_CM, estimate
 from phytofit.preparation import Prepared, prepare
+from phytofit.segmentation.plants import separate_plants
 from phytofit.species import Species, load_species
 
 __all__ = ["METHODS", "fit", "mean_at"]
@@ -113,6 +115,28 @@ def fit(
     used = {**_defaults(METHODS[method]), **search}
     CrossEntropy(species.space, **{name: value for name, value in used.items() if name in SEARCH})  # checks them
     species.with_stem_above(used["stem_above"])  # checks it
+    try:
+        return _fit(cloud, species, method, used, search, direction, seed_points, seed, threads, progress)
+    except NoPhytomerError as error:
+        plants = 1 if seed_points is not None else len(separate_plants(cloud, up=direction))
+        if plants == 1:
+            raise
+        raise NoPhytomerError(f"this looks like {plants} plants: {ONE_LEAF_ONLY}") from error
+
+
+def _fit(
+    cloud: PointCloud,
+    species: Species,
+    method: str,
+    used: Mapping[str, Any],
+    search: Mapping[str, Any],
+    direction: FloatArray | None,
+    seed_points: FloatArray | None,
+    seed: int,
+    threads: int | None,
+    progress: Callable[[Generation], None] | None,
+) -> Fit:
+    """As :func:`fit`, of settings that were checked: `used`, of which `search` were chosen."""
     one_thread = threadpool_limits(limits=1, user_api="blas")  # more would round sums in another order
     with one_thread, ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
         found = prepare(
