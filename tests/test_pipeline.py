@@ -114,7 +114,7 @@ def test_what_is_damaged_is_made_again_and_what_was_edited_is_not_lost(made, tmp
     edited = read_cloud(cloud, "cm", plausible_cm=(0.0, 500.0))
     write_cloud(cloud, edited.take(np.arange(len(edited) - 1)))
     before = cloud.read_bytes()
-    with pytest.raises(InputError, match="--labels label"):
+    with pytest.raises(InputError, match="name the property that holds them, label"):
         run(folder / "plant.ply", out, units="cm", up="z")
     assert cloud.read_bytes() == before
 
@@ -320,3 +320,14 @@ def test_a_real_scan_becomes_a_table(tmp_path):
     count = table.loc[table["trait"] == "leaf_count", "value"].item()
     assert 7 <= count <= 10  # eight in the mesh, and a small dry one
     assert json.loads((tmp_path / "reconstruction" / "reconstruction.json").read_text())["flags"] == []
+
+
+def test_a_camera_makes_a_folder_of_images_and_a_cloud_one_of_images(tmp_path):
+    folder = tmp_path / "scan"
+    folder.mkdir()
+    (folder / "view_0.png").write_bytes(b"no image")
+    write_cloud(folder / "mesh.ply", from_points(np.random.default_rng(0).random((200, 3)) * 30.0, "cm"))
+    done = CliRunner().invoke(app, ["run", str(folder), "--camera", "kinect-v2", "--out", str(tmp_path / "out")])
+    assert done.exit_code == 2
+    assert "view_0.png" in done.output
+    assert "point cloud" not in done.output

@@ -56,12 +56,13 @@ def cloud_files(given: Sequence[str]) -> tuple[list[Path], list[Path]]:
     return clouds, skipped
 
 
-def holds_images(folder: Path) -> bool:
-    """Whether a folder is one of images, rather than of clouds."""
+def holds_images(folder: Path, *, with_camera: bool = False) -> bool:
+    """Whether a folder is one of images, rather than of clouds; where it holds both, a camera says that it is."""
     if not os.path.isdir(folder):
         return False
     names = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
-    return any(_suffix(name) in (*IMAGES, *PHOTOS) for name in names) and not any(_is_cloud(name) for name in names)
+    images, clouds = (_suffix(name) in (*IMAGES, *PHOTOS) for name in names), map(_is_cloud, names)
+    return any(images) and (with_camera or not any(clouds))
 
 
 def check_images(folder: Path) -> None:

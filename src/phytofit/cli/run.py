@@ -120,7 +120,8 @@ def run_command(
 def _plants(context: typer.Context, sources: list[str], folder: Path) -> tuple[list[Path], list[Path]]:
     """What to measure: folders of images, or clouds; and what was skipped.  The options for the one are refused for the
     other."""
-    images = [Path(source) for source in sources if holds_images(Path(source))]
+    with_camera = bool(context.params["camera"])
+    images = [Path(source) for source in sources if holds_images(Path(source), with_camera=with_camera)]
     if not images:
         only(context, FOR_IMAGES, "for a folder of depth images, and this is a point cloud; leave it out")
         return cloud_files(sources)
