@@ -22,10 +22,16 @@ class Dialect(NamedTuple):
 
 
 def rows(
-    points: np.ndarray, separator: str, *, more: str = "", end: str = "\n", number: Callable[[float], str] = repr
+    points: np.ndarray,
+    separator: str,
+    *,
+    begin: str = "",
+    more: str = "",
+    end: str = "\n",
+    number: Callable[[float], str] = repr,
 ) -> str:
-    """Rows of numbers, each followed by more columns, if any."""
-    return "".join(separator.join(map(number, row)) + more + end for row in points.tolist())
+    """Rows of numbers, each after and before more columns, if any."""
+    return "".join(begin + separator.join(map(number, row)) + more + end for row in points.tolist())
 
 
 def comma(value: float) -> str:
@@ -55,6 +61,12 @@ def mixed_blanks(points: np.ndarray) -> bytes:
     return "".join(
         gaps[i % 4].join(map(repr, row)) + gaps[i % 3] + "\n" for i, row in enumerate(points.tolist())
     ).encode()
+
+
+def table_of_r(points: np.ndarray) -> bytes:
+    """As write.table writes it: the rows have names, and their column has none."""
+    lines = rows(points, " ", more=" 3").splitlines()
+    return b'"x" "y" "z" "intensity"\n' + "".join(f'"{i}" {row}\n' for i, row in enumerate(lines, 1)).encode()
 
 
 def numbered(points: np.ndarray) -> bytes:
@@ -109,6 +121,21 @@ TEXT = {
     "names that are quoted": Dialect(".txt", lambda p: text(p, head='"x" "y" "z" "plant id"\n', more=' "A 7"')),
     "a title": Dialect(".csv", lambda p: text(p, ",", head="Leaf of maize\nX,Y,Z\n")),
     "sep=": Dialect(".csv", lambda p: text(p, ";", head="sep=;\nX;Y;Z\n", number=comma)),
+    "bars": Dialect(".txt", lambda p: text(p, "|", head="X|Y|Z\n", number=comma)),
+    "leading commas": Dialect(".csv", lambda p: text(p, ",", begin=",")),
+    "leading tabs": Dialect(".txt", lambda p: text(p, "\t", head="\tX\tY\tZ\t\n", begin="\t", more="\t")),
+    "UTF-16 LE, other letters first": Dialect(
+        ".csv", lambda p: text(p, ";", head="Höhe;x;y;z\n", begin="7;", encoding="utf-16-le")
+    ),
+    "UTF-16 BE, other letters first": Dialect(
+        ".csv", lambda p: text(p, ";", head="Ωmega;x;y;z\n", begin="7;", encoding="utf-16-be")
+    ),
+    "R": Dialect(".txt", table_of_r),
+    "one name twice": Dialect(".csv", lambda p: text(p[:, [0, 1, 2, 0]], ",", head="x,y,z,x\n")),
+    "comments of other programs": Dialect(
+        ".txt", lambda p: text(p[:, [2, 1, 0]], head="/* exported */\n! in the field\n* by hand\n; Z Y X\n")
+    ),
+    "a line under the names": Dialect(".txt", lambda p: text(p, head="x y z\n-----------\ncm cm cm\n"), unit="cm"),
     "files joined": Dialect(".csv", lambda p: text(p[:50], ",", head="x,y,z\n") + text(p[50:], ",", head="x,y,z\n")),
     "PTS": Dialect(".pts", lambda p: text(p, head=f"{len(p)}\n", more=" -1200 255 0 0")),
     "PTS in TXT": Dialect(".txt", lambda p: text(p, head=f"{len(p)}\r\n", more=" -700", end="\r\n")),

@@ -144,7 +144,7 @@ ERRORS = [
     ("a.txt", "a leaf of maize\n", "a.txt: holds no rows, expected x y z on each line; found 'a leaf of maize'"),
     ("a.csv", "east,north,up\n1,2,3\n", "a.csv: no property x, y, z, found 'east', 'north', 'up'; name them so"),
     ("a.csv", "x,y,z\n1,2,3,4\n", "a.csv: found 3 column names over 4 columns; name each column"),
-    ("a.csv", "x,x,y,z\n1,2,3,4\n", "a.csv: no property x, y, z, found 'x', 'x', 'y', 'z'; name them so"),
+    ("a.csv", "x,x,y,z\n1,2,3,4\n", "a.csv: columns 'x', 'x' could all be x; rename all but one"),
     ("a.txt", "# c\n1 2 3\n1 2 3 4\n", "a.txt: line 3 has 4 columns, expected 3; export it again"),
     ("a.txt", XYZ_TEXT + "1 2 leaf\n", "a.txt: line 121 holds 'leaf' in column '3', expected a number"),
     ("a.csv", "x;y;z\n1;2;3\n1_000;2;3\n", "a.csv: line 3 holds '1_000' in column 'x', expected a number"),

@@ -401,6 +401,12 @@ SPELLED = [
     "NA",
     "#N/A",
     "1e999",
+    "NAN",
+    "Null",
+    "∞",
+    "*****",
+    "#VALUE!",
+    "(null)",
 ]
 
 
@@ -416,6 +422,24 @@ def test_rows_that_are_not_finite_are_dropped_however_it_is_spelled(tmp_path: Pa
             cloud = read_cloud(put(tmp_path / name, content), "cm")
         assert (len(caught), cloud.notes) == (1, (note,))
         np.testing.assert_array_equal(cloud.points, POINTS)
+
+
+@pytest.mark.parametrize("word", ["NA", "n/a", "NULL", "-", "1,#QNAN", "nan", "***"])
+def test_the_first_row_may_be_missing(tmp_path: Path, word: str) -> None:
+    path = put(tmp_path / "a.xyz", f"{word} {word} {word}\n".encode() + text(POINTS))
+    with pytest.warns(UserWarning, match=r"^a\.xyz: 1 non-finite point dropped$"):
+        cloud = read_cloud(path, "cm")
+    np.testing.assert_array_equal(cloud.points, POINTS)
+
+
+def test_columns_that_may_all_be_coordinates_are_refused(tmp_path: Path) -> None:
+    count = np.arange(N)
+    for first, number in (([LABELS], 1), ([count // 9, count], 1), ([count, count // 9], 2)):
+        path = put(tmp_path / "a.xyz", text(np.column_stack([*first, POINTS])))
+        with pytest.raises(
+            CloudError, match=rf"^a\.xyz: which columns are x y z\? none has a name, and column {number} "
+        ):
+            read_cloud(path, "cm")
 
 
 def test_numbers_of_a_text_file_are_read_exactly(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import re
 from collections.abc import Collection, Sequence
 from typing import NamedTuple
@@ -17,7 +18,8 @@ from phytofit.cloud.table import COLOR, NORMAL, XYZ, FileError, Table, keys_of, 
 __all__ = ["read"]
 
 LINE = re.compile(r"^[ \t]*(?=\S).*", re.MULTILINE)
-COMMENT = re.compile(r"^[ \t]*(?:#|//|%).*", re.MULTILINE)
+COMMENT = re.compile(r"^[ \t]*(?:#|//|/\*|%|!|\*(?=[ \t])|;(?=[ \t]+[^\W\d])).*", re.MULTILINE)
+RULE = re.compile(r"[-=_+|:;,\s]*[-=_]{2}[-=_+|:;,\s]*")  # a line drawn under the names
 COUNT = re.compile(r"^[ \t]*(\d{1,18})[ \t;,]*$", re.MULTILINE)
 SEPARATOR_LINE = re.compile(r'"?sep=.?"?', re.IGNORECASE)  # the first line of some spreadsheets' exports
 DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?", re.ASCII)
@@ -25,6 +27,7 @@ QUOTED_COMMA = re.compile(r'"([-+]?\d+),(\d+(?:[eE][-+]?\d+)?)"', re.ASCII)
 IN_BRACKETS = re.compile(r"[\[(][^\])]*[\])]")
 UNIT = re.compile(r"\bx(?:\s*[\[(]\s*(mm|cm|m)\s*[\])]|_(mm|cm|m)\b)", re.IGNORECASE)
 MOST_COLUMNS = 1000
+ROWS_LOOKED_AT = 100  # to tell whether their first words name them
 
 
 class _Head(NamedTuple):
@@ -43,13 +46,15 @@ def read(data: bytes, wanted: Collection[str]) -> Table:
     text = decoded(data)
     if "\0" in text:
         raise FileError("holds binary data, expected text with x y z on each line; is the suffix right?")
+    if ";" not in text:
+        text = text.replace("|", ";")
     head = _head(text)
     separator, body = _with_decimal_points(plain_nan(COMMENT.sub("", text[head.start :])))
     n_most = _n_columns(body, separator)
     body = _without_trailing(body, separator)
     n_columns = _n_columns(body, separator)
     _check_columns(n_columns, n_most, head)
-    names = _names(head, separator, n_columns, n_most)
+    names = _names(head, separator, n_columns, n_most, has_row_names=_has_row_names(body, separator))
     is_pts, body, notes = _without_counts(body, head.counts)
     if head.names and not head.is_comment:
         body = re.sub(
@@ -57,7 +62,9 @@ def read(data: bytes, wanted: Collection[str]) -> Table:
         )  # files joined end to end
     rows = _Rows(body, separator, names or [str(i + 1) for i in range(n_columns)], 1 + text.count("\n", 0, head.start))
     if names is None:
-        values = rows.parsed({i for i, word in enumerate(rows.first()) if is_number(word)})
+        values = rows.parsed(
+            {i for i, word in enumerate(rows.first()) if is_number(word) or (word and word.lower() in MISSING)}
+        )
         names, unnamed = _guessed_names(values, n_columns, is_pts=is_pts)
         notes += unnamed
     else:
@@ -91,23 +98,27 @@ def _head(text: str) -> _Head:
     for line in LINE.finditer(text):
         content = line[0].strip()
         if COMMENT.match(content):
-            content = content.lstrip("#/% \t")
+            content = content.lstrip("#/%!*; \t")
             names = content if is_comment and _names_points(content) else names
-        elif SEPARATOR_LINE.fullmatch(content):
+        elif SEPARATOR_LINE.fullmatch(content) or RULE.fullmatch(content):
             pass
         elif not is_comment and (units := _units(content)):
             unit = units[0]
         elif count := COUNT.fullmatch(content):
             counts.append(int(count[1]))
-        elif not is_comment or all(
-            is_number(word) for word in re.split(r"[;,\s]+", content.replace('"', ""), maxsplit=3)[:3]
-        ):
+        elif not is_comment or _is_row(content):
             return _Head(names, is_comment, unit, counts, title, line.start())
         elif _names_points(content):
             names, is_comment = content, False
         else:
             title = content
     return _Head(names, is_comment, unit, counts, title, len(text))
+
+
+def _is_row(line: str) -> bool:
+    """Whether a line begins with three numbers, some of which may be missing."""
+    words = re.split(r"[;,\s]+", plain_nan(line).replace('"', ""), maxsplit=3)[:3]
+    return any(words) and all(is_number(word) or word.lower() in MISSING for word in words)
 
 
 def _units(line: str) -> list[str]:
@@ -166,8 +177,17 @@ def _without_trailing(body: str, separator: str | None) -> str:
     return re.sub(f"(?<!{marks}){marks}+$|^{marks}+$", "", body, flags=re.MULTILINE)
 
 
-def _names(head: _Head, separator: str | None, n_least: int, n_most: int) -> list[str] | None:
-    """The names of so many columns; None if there are none.
+def _has_row_names(body: str, separator: str | None) -> bool:
+    """Whether the first column numbers or names the rows, as in tables of R, or is empty."""
+    rows = [row[0] for row in itertools.islice(LINE.finditer(body), ROWS_LOOKED_AT)]
+    first = [next(iter(_words(row, separator)), "") for row in rows]
+    if not rows or not is_number(first[0]) or (rows[0].lstrip().startswith('"') and rows[0].count('"') == 2):
+        return True
+    return len(rows) > 1 and any(first == [str(i + begin) for i in range(len(rows))] for begin in (0, 1))
+
+
+def _names(head: _Head, separator: str | None, n_least: int, n_most: int, *, has_row_names: bool) -> list[str] | None:
+    """The names of so many columns; None if there are none.  That of the rows' own names may be missing.
 
     FileError if a row of names does not fit.  A comment that does not is only a comment.
     """
@@ -177,6 +197,8 @@ def _names(head: _Head, separator: str | None, n_least: int, n_most: int) -> lis
             n_named = max((i + 1 for i, word in enumerate(words) if word), default=0)
             if n_named <= n_most and n_least <= len(words) and names_points(words):
                 return words[: max(n_named, n_least)]
+            if has_row_names and len(words) + 1 == n_least and names_points(words):
+                return ["", *words]
     if head.names and not head.is_comment:
         n_named = len(_words(head.names, separator))
         raise FileError(f"found {n_named} column names over {n_least} columns; name each column")
@@ -228,7 +250,7 @@ class _Rows(NamedTuple):
                 header=None,
                 dtype={i: np.float64 if i in of_numbers else str for i in range(len(self.names))},
                 skipinitialspace=True,
-                na_values=[*MISSING],
+                na_values=[spelling for word in MISSING for spelling in (word, word.upper(), word.capitalize())],
             )
         except ValueError:
             self._check(of_numbers)
@@ -254,11 +276,16 @@ def _guessed_names(
 
     Whole numbers may be labels, intensities, or anything: they are never taken for labels.
     """
-    n = len(values[0])
-    at = int(n_columns > 3 and any(np.array_equal(values[0], np.arange(n) + first) for first in (0, 1)))
+    at = min(values, default=0)
+    n = len(values.get(at, ()))
+    is_numbered = n_columns > at + 3 and any(np.array_equal(values[at], np.arange(n) + first) for first in (0, 1))
+    at += is_numbered
     names = [str(i + 1) for i in range(n_columns)]
     names[at : at + 3] = XYZ
-    notes: tuple[str, ...] = ("column 1 numbers the rows: x y z are columns 2 to 4",) if at else ()
+    notes: tuple[str, ...] = ()
+    if is_numbered:
+        notes = (f"column {at} numbers the rows: x y z are columns {at + 1} to {at + 3}",)
+    _check_coordinates(values, at)
     more = [values[i][np.isfinite(values[i])] for i in range(at + 3, n_columns) if i in values]
     is_color = [bool((v == np.rint(v)).all() and (v >= 0).all() and (v <= 255).all()) for v in more[-3:]]
     is_known = len(more) == 4 and all(is_color)
@@ -273,3 +300,19 @@ def _guessed_names(
         )
         notes += (f"{which}: not used",)
     return names, notes
+
+
+def _check_coordinates(values: dict[int, NDArray[np.float64]], at: int) -> None:
+    """FileError if the columns from `at` on can't be x y z: words, or whole numbers beside others, while those that
+    follow are all alike."""
+    if not values.keys() >= {at, at + 1, at + 2}:
+        raise FileError("expected x y z in the first columns, found words among them; put their names in a line above")
+    is_whole = {i: bool((v[np.isfinite(v)] == np.rint(v[np.isfinite(v)])).all()) for i, v in values.items()}
+    if len({is_whole[at + i] for i in range(3)}) == 1:
+        return
+    if any(not any(is_whole.get(i + j, True) for j in range(3)) for i in (at + 1, at + 2)):
+        odd = next(i for i in range(at, at + 3) if is_whole[i])
+        raise FileError(
+            f"which columns are x y z? none has a name, and column {odd + 1} holds whole numbers only, unlike those "
+            "beside it; put their names in a line above"
+        )

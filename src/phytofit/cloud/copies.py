@@ -87,7 +87,7 @@ def _stacks(places: FloatArray, count: NDArray[np.intp]) -> NDArray[np.bool_]:
 
 
 def _stack_note(point: FloatArray, n: int) -> str:
-    at = ", ".join(f"{value:g}" for value in point)
+    at = ", ".join(f"{value + 0.0:g}" for value in point)
     return f"{n} points stacked at ({at}) dropped: no surface, most likely places where the sensor saw nothing"
 
 

@@ -15,7 +15,7 @@ MARKS = (
     (codecs.BOM_UTF16_BE, "utf-16-be"),
 )
 OF_TYPESETTERS = dict.fromkeys(map(ord, "\u00a0\u2009\u202f\u3000"), " ") | {ord("\u2212"): "-"}  # blanks and minus
-UNMARKED = ((re.compile(rb"(?:[\t\n\r -~]\0){4}"), "utf-16-le"), (re.compile(rb"(?:\0[\t\n\r -~]){4}"), "utf-16-be"))
+SAMPLE = 400  # bytes by which UTF-16 without a mark is told: one half of each character is zero in most
 CONTENTS = (  # what a file is whose first bytes are these, and the suffixes that it may have, if it is a cloud
     (rb"\x00\x05\x16\x07", "a macOS resource file that lies beside the cloud, not a cloud; leave it out", ()),
     (rb"ply[ \t]*[\r\n]", "PLY", (".ply",)),
@@ -32,7 +32,7 @@ CONTENTS = (  # what a file is whose first bytes are these, and the suffixes tha
 def in_utf8(data: bytes) -> bytes:
     """The bytes, as UTF-8 without a mark if they are text that is marked or was written as UTF-16."""
     encoding = next((name for mark, name in MARKS if data.startswith(mark)), None)
-    encoding = encoding or next((name for start, name in UNMARKED if start.match(data)), None)
+    encoding = encoding or _unmarked(data)
     if encoding is None:
         return data
     if encoding == "utf-8":
@@ -43,6 +43,15 @@ def in_utf8(data: bytes) -> bytes:
         raise FileError(
             f"truncated or damaged: it starts as {encoding.upper()}, and goes on as something else"
         ) from error
+
+
+def _unmarked(data: bytes) -> str | None:
+    """UTF-16 without a mark, by its zeros: most of one half of the bytes, and none of the other."""
+    low, high = data[:SAMPLE:2], data[1:SAMPLE:2]
+    for zeros, others, name in ((high, low, "utf-16-le"), (low, high, "utf-16-be")):
+        if 2 * zeros.count(0) > len(zeros) and 0 not in others:
+            return name
+    return None
 
 
 def decoded(data: bytes) -> str:

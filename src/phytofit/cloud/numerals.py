@@ -11,9 +11,16 @@ from phytofit.cloud.table import FileError, quoted
 __all__ = ["MISSING", "NUMBER", "is_number", "numbers", "plain_nan"]
 
 NUMBER = re.compile(r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?", re.ASCII)
-MISSING = frozenset(("", "-", "--", ".", "na", "n/a", "#n/a", "none", "null", "nil"))
-NOT_FINITE = re.compile(r"[-+]?(?:[qs]?nan(?:\(\w*\))?|inf(?:inity)?|1[.,]#[a-z]+\d*)", re.IGNORECASE)
-NAN_OF_OTHERS = re.compile(r"[-+]?(?:\b[qs]nan\b|\bnan\(\w*\)|\b1[.,]#[a-z]+\d*)", re.IGNORECASE)  # 1.#QNAN, nan(ind)
+MISSING = frozenset(
+    (
+        *("", "-", "--", "---", ".", "na", "n/a", "<na>", "none", "null", "(null)", "nil", "undefined"),
+        *("#n/a", "#nv", "#num!", "#div/0!", "#value!"),
+    )
+)
+"""Words that stand for no number, in lower case."""
+NOT_FINITE = re.compile(r"[-+]?(?:[qs]?nan(?:\(\w*\))?|inf(?:inity)?|∞|1[.,]#[a-z]+\d*)|\*+", re.IGNORECASE)
+# 1.#QNAN and nan(ind) of compilers, and the stars of a number that was too wide for its place
+NAN_OF_OTHERS = re.compile(r"[-+]?(?:\bnan\(\w*\)|\b[qs]?nan\b|∞|\b1[.,]#[a-z]+\d*)|\*{2,}", re.IGNORECASE)
 
 
 def is_number(word: str) -> bool:
@@ -22,7 +29,7 @@ def is_number(word: str) -> bool:
 
 
 def plain_nan(text: str) -> str:
-    """The text with ``nan`` for the spellings of it that only some compilers know."""
+    """The text with ``nan`` for the spellings of it that not every reader knows."""
     return NAN_OF_OTHERS.sub("nan", text)
 
 
@@ -33,7 +40,7 @@ def numbers(words: Sequence[bytes]) -> NDArray[np.float64]:
             return np.fromiter(map(float, words), np.float64, len(words))
     except ValueError:
         pass
-    return np.array([_number(word.decode("latin-1")) for word in words])
+    return np.array([_number(word.decode("utf-8", "replace")) for word in words])
 
 
 def _number(word: str) -> float:

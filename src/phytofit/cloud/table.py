@@ -80,9 +80,8 @@ def _key_without_prefix(name: str) -> str:
 
 
 def names_points(names: Iterable[str]) -> bool:
-    """Whether x, y and z are among the names, each once."""
-    keys = [key_of(name) for name in names]
-    return all(keys.count(axis) == 1 for axis in XYZ)
+    """Whether x, y and z are among the names."""
+    return {key_of(name) for name in names} >= {*XYZ}
 
 
 def quoted(text: object) -> str:
