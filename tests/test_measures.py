@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from openpyxl import Workbook
+from openpyxl import Workbook, load_workbook
 
 import phytofit
 from phytofit.errors import InputError
@@ -97,6 +97,8 @@ def test_a_column_is_a_trait_in_a_unit(name, expected):
         ("Leaf area (cm)", "'cm' is no unit of leaf_area"),
         ("Leaf length (furlong)", "'furlong' is no unit known"),
         ("leaf length x width (cm)", "names length and width"),
+        ("Leaf length (0.1 mm)", "a number before its unit"),
+        ("Leaf length (x 10 cm)", "a number before its unit"),
     ],
 )
 def test_a_name_that_can_be_read_in_several_ways_is_refused(name, said):
@@ -104,7 +106,13 @@ def test_a_name_that_can_be_read_in_several_ways_is_refused(name, said):
         measured(name)
 
 
-@pytest.mark.parametrize("name", ["sheath length (cm)", "Leaf length SD (cm)", "leaf tip angle", "length/width ratio"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("sheath length (cm)", "Leaf length SD (cm)", "leaf tip angle", "length/width ratio"),
+        *("Blattlänge (cm)", "leaf angle from horizontal (deg)", "Leaf elevation angle"),
+    ],
+)
 def test_what_only_looks_like_a_trait_is_not_read_and_said(tmp_path, name):
     table = read(tmp_path, f"cloud,leaf_width_cm,{name}\na,4.5,3\n")
     assert values(table) == {("a", "leaf_width"): 4.5}
@@ -191,7 +199,8 @@ def test_what_is_no_positive_finite_number_is_refused_with_its_place(tmp_path, c
 
 
 @pytest.mark.parametrize(
-    "cell", ["", " ", "NA", "n/a", "N.A.", "#N/A", "nan", "NaN", "-nan(ind)", "n.d.", "-", "–", ".", "NULL"]
+    "cell",
+    ["", " ", "NA", "n/a", "N.A.", "#N/A", "nan", "NaN", "-nan(ind)", "n.d.", "n. d.", "n/d", "-", "–", ".", "NULL"],
 )
 def test_missing_values_are_none(tmp_path, cell):
     table = read(tmp_path, f"cloud,leaf_length_cm,leaf_angle\na,47.9,79\nb,72,{cell}\n")
@@ -255,6 +264,8 @@ def test_what_spreadsheets_do_to_a_table(tmp_path):
         (b"PK\x03\x04 and no more", "can't be read as an .xlsx workbook"),
         (bytes(range(256)) * 9, "binary data"),
         ('cloud,leaf_length_cm\na,"' + "5" * 200_000, "quotation mark"),
+        ('cloud,leaf_length_cm\na,5\nb,"6\nc,7\n', "row 3 goes on to the end of the file.*quotation mark"),
+        ("ID,length cm,ID,length cm\na,5,b,6\n", "columns 1 and 3 are both called 'ID', and differ"),
     ],
 )
 def test_what_is_no_table_of_measures_is_said(tmp_path, content, said):
@@ -306,6 +317,10 @@ def test_a_workbook_is_read(tmp_path):
     table = phytofit.read_measures(path)
     assert values(table) == {("a", "leaf_length"): 5.0}
     assert "sheet 'June' is not read" in table.attrs["notes"][0]
+    book = load_workbook(path)
+    book["May"].sheet_state, book.active = "hidden", 1
+    book.save(path)
+    assert values(phytofit.read_measures(path)) == {("a", "leaf_length"): 6.0}
 
 
 @pytest.mark.parametrize(

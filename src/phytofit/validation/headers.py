@@ -104,6 +104,7 @@ OTHER_PARTS = _set(
     "sheath petiole ligule auricle root roots panicle tassel ear cob spike awn tiller canopy pod seed shoot branch",
     "leaflet flower fruit node hypocotyl cotyledon coleoptile",
 )
+OTHER_FRAMES = _set("horizontal horizontally horizon elevation")  # from which an angle is counted; ours from the stem
 OTHER_PLACES = _set("tip base apex neck")  # of a leaf, whose traits are of all of it
 
 
@@ -149,7 +150,8 @@ def measured(name: str) -> Measured | None:
         words |= {"count"}
     quantities = sorted(words.intersection(SAME.get(w, w) for w in outside) & QUANTITIES) or sorted(words & QUANTITIES)
     if not quantities:
-        return None
+        is_length = any(len(phrase) == 1 and phrase[0] in FACTORS for phrase in inside)
+        return Measured("", "", None, "its name says no trait that is measured") if is_length else None
     way = next((way for way in WAYS if way.words <= words), None)
     strange = _strange(words, outside, way)
     if strange or way is None:
@@ -182,6 +184,7 @@ def _strange(words: set[str], outside: Sequence[str], way: _Way | None) -> str:
     """Why a column is not read, where its words may mean something else than a trait; else empty."""
     other = words & (OTHER_NUMBERS | OTHER_PARTS)
     if way is not None and way.trait.startswith("leaf"):
+        other |= words & OTHER_FRAMES if way.kind == "deg" else set()
         other |= (OTHER_PLACES & set(outside) if "to" not in outside else set()) | (words & {"plant"})
     if way is not None and way.alone:  # what else there is says of what organ it is
         other |= {w for w in words - way.words - SAYS_HOW if len(w) > 1 and not w.isdigit()}
@@ -207,6 +210,9 @@ def _unit_of(name: str, way: _Way) -> str:
             doubtful = before.isdigit() or (word in AMBIGUOUS and len(phrase) > 1)
             (weak if doubtful else strong).append(word)
     found = strong or weak
+    for phrase in [] if strong else _phrases(name)[1:]:
+        if len(phrase) > 1 and phrase[-1] in FACTORS and phrase[-2].isdigit():
+            raise ColumnError(f"column {name!r} has a number before its unit; write it as in {_example(way)!r}")
     fitting = [word for word in dict.fromkeys(found) if FACTORS[word][1] in (way.kind, way.kind.replace("cm", "rel"))]
     if found and not fitting:
         raise ColumnError(f"column {name!r}: {found[0]!r} is no unit of {way.trait}; write it as in {_example(way)!r}")

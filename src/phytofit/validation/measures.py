@@ -75,6 +75,7 @@ def read_measures(path: str | Path) -> pd.DataFrame:
     table, notes = read_table(path, _is_header, expected)
     table = _with_units_below(table)
     clouds = cloud_column(table.names)
+    _check_one_table(table, clouds)
     try:
         entries, unread = _tidy(table) if _is_tidy(table.names) else _wide(table, clouds[0])
     except ColumnError as error:
@@ -117,6 +118,18 @@ def read_results(path: str | Path) -> pd.DataFrame:
         made[name] = [_count(cell) or text_of(cell) for cell in cells]
     made["unit"] = [(unit_named(unit) or (1.0, unit))[1] for unit in made["unit"]]
     return made[made["value"].notna()].reset_index(drop=True)
+
+
+def _check_one_table(table: Table, clouds: Sequence[int]) -> None:
+    """InputError if there are several columns of clouds of one name, and they differ: tables side by side."""
+    first = clouds[0]
+    for i in clouds[1:]:
+        same = table.names[i].casefold() == table.names[first].casefold()
+        if same and any(text_of(row[i]) != text_of(row[first]) for row in table.rows):
+            raise InputError(
+                f"{table.where}: columns {first + 1} and {i + 1} are both called {quoted(table.names[i])}, and differ; "
+                "put tables that are side by side one below the other"
+            )
 
 
 def _is_header(names: Sequence[str]) -> bool:

@@ -12,7 +12,7 @@ __all__ = ["decimal_mark", "is_missing", "number_of"]
 MISSING = (  # as they are when case-folded
     *("", "na", "n/a", "n.a.", "n.a", "#n/a", "#n/v", "#nv", "<na>", "#div/0!"),
     *("nan", "-nan", "nan(ind)", "-nan(ind)", "1.#qnan", "-1.#qnan", "1.#ind", "-1.#ind", "none", "null", "nil"),
-    *("n.d.", "n.d", "nd", "n.m.", "n.m", "nm", "k.a.", "missing", "no data"),
+    *("n.d.", "n.d", "nd", "n/d", "n/m", "n.m.", "n.m", "nm", "k.a.", "missing", "no data"),
     *(
         "not available",
         "not measured",
@@ -37,7 +37,7 @@ PLAIN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d{1,9})?")
 
 def is_missing(cell: Cell) -> bool:
     """Whether a cell says, in one of the ways in use, that there is no value."""
-    return _plain(cell) in MISSING if isinstance(cell, str) else math.isnan(cell)
+    return _plain(cell).replace(". ", ".") in MISSING if isinstance(cell, str) else math.isnan(cell)
 
 
 def decimal_mark(cells: Iterable[Cell], separator: str) -> str | None:

@@ -43,7 +43,7 @@ class Sheet(NamedTuple):
 
 
 def read_sheets(path: Path) -> list[Sheet]:
-    """The sheets of a workbook (XLSX); of a text file the same cells by each separator that may be meant.
+    """The sheets of a workbook (XLSX), hidden ones last; of a text file its cells by each separator that may be meant.
 
     Raises InputError if the file can't be read, or is neither.
     """
@@ -109,8 +109,12 @@ def _dialects(text: str) -> Iterator[tuple[str, str]]:
 
 
 def _rows(text: str, separator: str) -> list[list[Cell]]:
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
-    return [list(row) for row in rows]
+    rows: list[list[Cell]] = [
+        list(row) for row in csv.reader(io.StringIO(text, newline=""), delimiter=separator, skipinitialspace=True)
+    ]
+    if text.count('"') % 2 and any("\n" in str(cell) for row in rows[-1:] for cell in row):
+        raise csv.Error(f"row {len(rows)} goes on to the end of the file")
+    return rows
 
 
 def _workbook(data: bytes, path: Path) -> list[Sheet]:
@@ -118,6 +122,9 @@ def _workbook(data: bytes, path: Path) -> list[Sheet]:
 
     def opened(values: bool) -> Any:
         return load_workbook(io.BytesIO(data), read_only=True, data_only=values)
+
+    def shown_first(sheets: Any) -> Any:
+        return sorted(sheets, key=lambda sheet: sheet.sheet_state != "visible")
 
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -127,7 +134,7 @@ def _workbook(data: bytes, path: Path) -> list[Sheet]:
                 raise InputError(f"{path}: unpacks to more than {MOST_UNPACKED // 1_000_000} MB; is it a workbook?")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what a workbook has beside its cells
-            found = [Sheet(sheet.title, _cells(sheet), "") for sheet in opened(True).worksheets]
+            found = [Sheet(sheet.title, _cells(sheet), "") for sheet in shown_first(opened(True).worksheets)]
             formulas = {sheet.title: _cells(sheet) for sheet in opened(False).worksheets}
     except InputError:
         raise
