@@ -47,6 +47,11 @@ def made():
     return phytofit.simulate(fixed=FIXED, n_points=1000, noise_cm=0.3, random_orientation=False, seed=4)
 
 
+@pytest.fixture(scope="module")
+def fitted(made):
+    return phytofit.fit(made.points, "cm", threads=2)
+
+
 def with_another_leaf(made, lower=4.0, turn=180.0, every=1):
     """Points and labels of the phytomer with a second leaf, labelled 3, of which every so-many-th point is there."""
     leaf = made.points[made.labels == 2][::every]
@@ -129,3 +134,24 @@ def test_what_a_seed_point_leaves_of_others_is_a_flag(made):
     crowded = remarked(dataclasses.replace(found, estimate=dataclasses.replace(found.estimate, sighting=seen)))
     assert all(any("30 % of the points lie on surfaces" in flag for flag in t.flags) for t in crowded.traits)
     assert any(flag.startswith(UNUSABLE) for flag in crowded.flags)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("stem_diameter", 8.0, "no stem in this cloud: .* 8 cm thick, far thicker than a stem of sorghum"),
+        ("leaf_length", 5.0, "no leaf in this cloud: .* as short as a leaf of sorghum can be, 5 cm"),
+    ],
+)
+def test_what_is_too_large_for_a_stem_or_too_short_for_a_leaf_is_none(fitted, name, value, said):
+    x = fitted.x.copy()
+    x[fitted.species.space.index(name)] = value
+    with pytest.raises(phytofit.NoPhytomerError, match=said):
+        remarked(dataclasses.replace(fitted, x=x))
+    remarked(dataclasses.replace(fitted, x=x), labelled=True)  # then it is known what is stem and leaf
+
+
+def test_without_a_unit_no_stem_is_too_thick(fitted):
+    x = fitted.x.copy()
+    x[0] = 8.0
+    assert remarked(dataclasses.replace(fitted, x=x, relative=True)).flags

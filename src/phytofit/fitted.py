@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from phytofit.display import Shown, Summary
 from phytofit.errors import NoPhytomerError, Status
-from phytofit.flags import FEW_ON_STEM, ONE_LEAF_ONLY, UNUSABLE, flags_of
+from phytofit.flags import FEW_ON_STEM, IMPLAUSIBLE, NEAR_BOUND, ONE_LEAF_ONLY, UNUSABLE, flags_of
 from phytofit.intervals import Ends, propagated
 from phytofit.models import STEM, Organ, move
 from phytofit.objectives import Registration
@@ -27,12 +27,16 @@ __all__ = ["Fit", "beside_its_rival", "remarked"]
 FloatArray = NDArray[np.float64]
 LEAST_ON_STEM = 10.0  # points; with fewer it is no stem
 THIN = 2.0  # spreads of the prior, by which a stem is thinner than expected
-MUCH_ELSEWHERE = 0.12  # share of the points; phytomers have up to 0.04, other clouds mostly 0.15 and more
+MUCH_ELSEWHERE = 0.08  # share of the points; phytomers have up to 0.06, those fitted wrongly and others 0.1 and more
 SPARSE = 0.4  # of the leaf's density of points; a stem seen from one side has half
 NO_STEM = (
     "no stem in this cloud: the {:.0f} points that look most like one may belong to the leaf; keep some stem below the "
     "leaf"
 )
+THICK_STEM = (
+    "no stem in this cloud: what looks most like one is {:.3g} cm thick, far thicker than a stem of {}; check the unit"
+)
+NO_LEAF = "no leaf in this cloud: what looks most like one is as short as a leaf of {} can be, {:g} cm; check the unit"
 MORE_THAN_ONE_LEAF = "{:.0f} % of the points lie on surfaces that are neither the fitted stem nor the fitted leaf"
 INTERVAL_METHOD = "sandwich interval"
 OPEN_WITHOUT_TIP = ("leaf_length", "leaf_area")  # no upper end where the tip was not seen
@@ -234,6 +238,8 @@ def remarked(result: Fit, *, labelled: bool = False) -> Fit:
     if not labelled:
         if _lacks_stem(result, made):
             raise NoPhytomerError(NO_STEM.format(made.sighting.stem_points))
+        if not result.relative:
+            _check_sizes(result)
         if made.sighting.elsewhere > MUCH_ELSEWHERE:
             text = MORE_THAN_ONE_LEAF.format(100.0 * made.sighting.elsewhere)
             if result.settings.get("seed_point") is None:
@@ -252,6 +258,17 @@ def remarked(result: Fit, *, labelled: bool = False) -> Fit:
         scale=result.scale,
     )
     return replace(result, flags=(*result.flags, *flags))
+
+
+def _check_sizes(result: Fit) -> None:
+    """NoPhytomerError where the stem is far thicker than any, or the leaf as short as one can be: it is none."""
+    space, name = result.species.space, result.species.name
+    expected = space.parameters[space.index("stem_diameter")]
+    if result.parameters["stem_diameter"] > expected.mean + IMPLAUSIBLE * expected.std:
+        raise NoPhytomerError(THICK_STEM.format(result.parameters["stem_diameter"], name))
+    shortest = space.parameters[space.index("leaf_length")].lower
+    if result.parameters["leaf_length"] <= shortest + NEAR_BOUND:
+        raise NoPhytomerError(NO_LEAF.format(name, shortest))
 
 
 def _lacks_stem(result: Fit, made: Estimate) -> bool:

@@ -15,6 +15,8 @@ from phytofit.unexplained import on_something_else
 
 __all__ = [
     "FEW_ON_STEM",
+    "IMPLAUSIBLE",
+    "NEAR_BOUND",
     "OFFSET",
     "UNUSABLE",
     "Sighting",
