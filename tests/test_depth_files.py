@@ -48,6 +48,30 @@ def test_what_is_no_return_counts_as_none_whatever_stands_for_it(none, kind, tmp
     assert all("17 % of the pixels" in note for note in notes)
 
 
+@pytest.mark.parametrize(
+    ("none", "unit"),
+    [(-1, "mm"), (-9999, "mm"), (65.535, "m"), (32.767, "m"), (65534, "mm"), (3.4e38, "mm"), (4095, "mm"), (1, "mm")],
+)
+@pytest.mark.parametrize("name", ["a.npy", "a.tif"])
+def test_what_most_pixels_hold_is_no_distance_where_it_can_be_none(none, unit, name, tmp_path):
+    stored = image().astype(np.float32)
+    stored[:18] = 0
+    expected = stored / 10.0
+    stored /= 1000 if unit == "m" else 1
+    stored[:18] = none
+    depth, notes = read_one(tmp_path, stored, name, camera=FAR, unit=unit)
+    assert depth == pytest.approx(expected, abs=1e-4)
+    assert notes == (f"75 % of the pixels hold {np.float32(none):g}: no return",)
+
+
+def test_one_negative_value_is_no_distance_however_rare(tmp_path):
+    stored = image().astype(np.float32)
+    stored[10, 10] = -1
+    depth, _ = read_one(tmp_path, stored)
+    assert depth[10, 10] == 0.0
+    assert np.count_nonzero(depth) == 20 * 32 - 1
+
+
 @pytest.mark.parametrize("kind", [np.int16, np.uint16, np.int32])
 def test_the_largest_value_of_a_type_is_no_distance(kind, tmp_path):
     stored = image().astype(kind)
@@ -109,7 +133,7 @@ def test_a_cloud_in_place_of_a_folder(tmp_path):
         (np.ones((12, 32), np.uint16), "a.png", "found 32 x 12 pixels, expected 32 x 24 of the camera small"),
         (np.ones((24, 32, 1), np.uint16), "a.npy", "an array of shape .24, 32, 1."),
         (np.ones((24, 32), bool), "a.npy", "type bool"),
-        (-np.ones((24, 32)), "a.npy", "negative depths"),
+        (-image().astype(float), "a.npy", "negative depths"),
         (np.zeros((24, 32), np.uint16), "a.npy", "no pixel holds a distance"),
     ],
 )

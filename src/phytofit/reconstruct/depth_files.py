@@ -86,7 +86,8 @@ def read_views(
     """Read depth images: 16-bit PNG or TIFF, or NPY; and notes on what was taken for no distance.
 
     0 and what is not finite are no distances; nor are the largest value that a whole number of the file's type can
-    have, 65535 and 65536, and what is nearer or farther than the camera sees.
+    have, 65535 and 65536, what is nearer or farther than the camera sees, the only negative value, and the most common
+    of all values where that is the largest, or beyond what the camera sees.
 
     Parameters
     ----------
@@ -106,29 +107,54 @@ def read_views(
         raise SettingError(f"unit: expected mm, cm or m, got {shortened(repr(unit))}")
     step_cm = camera.step_cm if unit is None else SCALE_CM[unit]
     stored = [_stored(path, camera) for path in files]
-    depths, n_full = [], 0
-    for path, image in zip(files, stored, strict=True):
-        full = np.isin(image, NO_RETURN) if image.dtype.kind == "f" else image == np.iinfo(image.dtype).max
-        full |= np.isin(image, NO_RETURN)
-        n_full += int(full.sum())
+    is_full = [_is_full(image) for image in stored]
+    n_full = sum(int(full.sum()) for full in is_full)
+    low, high = camera.range_cm
+    none = _no_return(
+        [image[~full] for image, full in zip(stored, is_full, strict=True)], low / step_cm, high / step_cm
+    )
+    depths, n_none = [], 0
+    for path, image, full in zip(files, stored, is_full, strict=True):
+        n_none += int((image == none).sum())
         with np.errstate(invalid="ignore", over="ignore"):
             depth = np.nan_to_num(image.astype(float), nan=0.0, posinf=0.0, neginf=0.0) * step_cm
-        depth[full] = 0.0
+        depth[full | (image == none)] = 0.0
         if (depth < 0).any():
             raise InputError(f"{path.name}: found negative depths, expected distances, and 0 where nothing came back")
         depths.append(depth)
     n_beyond = _check_range(files, depths, camera, unit or camera.unit)
-    low, high = camera.range_cm
     for depth in depths:
         depth[(depth < low) | (depth > high)] = 0.0
     n_pixels = len(files) * camera.width * camera.height
     notes = []
     if n_full:
         notes.append(f"{_percent(n_full, n_pixels)} of the pixels hold the largest possible value: no return")
+    if n_none:
+        notes.append(f"{_percent(n_none, n_pixels)} of the pixels hold {none:g}: no return")
     if n_beyond:
         seen = f"{low:g} to {high:g} cm"
         notes.append(f"{_percent(n_beyond, n_pixels)} of the pixels are left out: outside the camera's range, {seen}")
     return [DepthView(path.name, depth) for path, depth in zip(files, depths, strict=True)], tuple(notes)
+
+
+def _is_full(image: NDArray[Any]) -> NDArray[np.bool_]:
+    """Where an image holds the largest value that its type can have, or what that becomes in others."""
+    full: NDArray[np.bool_] = np.isin(image, NO_RETURN)
+    return full if image.dtype.kind == "f" else full | (image == np.iinfo(image.dtype).max)
+
+
+def _no_return(images: Sequence[NDArray[Any]], low: float, high: float) -> float:
+    """The value that stands for no distance in these images, NaN if there is none: the only negative one; or that which
+    is more common than any other, and is beyond what the camera sees (`low` to `high`, as stored), or the largest."""
+    values, counts = np.unique(
+        np.concatenate([image[np.isfinite(image) & (image != 0)] for image in images]), return_counts=True
+    )
+    if np.count_nonzero(values < 0) == 1:
+        return float(values[0])
+    if len(values) < 2 or np.count_nonzero(counts == counts.max()) > 1:
+        return np.nan
+    common = values[counts.argmax()]
+    return float(common) if common == values[-1] or not low <= common <= high else np.nan
 
 
 def _percent(part: int, whole: int) -> str:
