@@ -133,7 +133,8 @@ def test_a_column_of_another_name_is_never_taken_for_labels(tmp_path: Path, name
         np.testing.assert_array_equal(asked.labels, LABELS)
         assert asked.labels_from == name
         with pytest.raises(
-            CloudError, match=rf"^a{suffix}: no property Leaf, found '[xX]', '[yY]', '[zZ]', '{name}'; nam"
+            CloudError,
+            match=rf"^a{suffix}: no property 'Leaf' with labels, found '[xX]', '[yY]', '[zZ]', '{name}'; choo",
         ):
             read_cloud(path, "cm", label_property="Leaf")
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from phytofit import NoPhytomerError, fit, from_points, read_cloud, write_cloud
 from phytofit.cli import app
-from phytofit.errors import InputError, OutputError
+from phytofit.errors import InputError, OutputError, SettingError
 from phytofit.pipeline import plant_traits, run
 from phytofit.pipeline.stages import done, is_edited, key_of, up_to_date
 from phytofit.results import COLUMNS, read_segmentation
@@ -167,6 +167,23 @@ def test_a_fit_that_leaves_most_of_the_points_out_is_not_the_leaf(made, first_fi
     lengths = found.table[found.table["trait"] == "leaf_length"]
     assert lengths["value"].tolist() == [printed(leaf.length) for leaf in found.segmentations[0].leaves]
     assert all("not fitted: the model does not explain 60 % of the points" in flags for flags in lengths["flags"])
+
+
+def test_meshes_and_a_workbook_are_written_where_they_are_asked_for(made, first_fit, tmp_path, monkeypatch):
+    monkeypatch.setattr("phytofit.pipeline.plant.fit", lambda phytomer, **how: first_fit)
+    arguments = ["run", str(made[0] / "plant.ply"), "-u", "cm", "--up", "z", "--out", str(tmp_path)]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    first = {path.name for path in (tmp_path / "leaves" / "leaf_01").iterdir()}
+    assert first == {"fit.json", "fit.png", "model.ply", "stage.json", "traits.csv"}
+    assert not (tmp_path / "traits.xlsx").exists()
+    done = CliRunner().invoke(app, [*arguments, "--mesh", "obj", "--mesh", "glb", "--xlsx"])
+    assert "up to date, skipped: segment" in done.output
+    for leaf in (tmp_path / "leaves").iterdir():
+        assert {path.name for path in leaf.iterdir()} == first | {"model.obj", "model.glb"}
+    table = pd.read_csv(tmp_path / "traits.csv")
+    assert pd.read_excel(tmp_path / "traits.xlsx")["value"].tolist() == pytest.approx(table["value"].tolist())
+    with pytest.raises(SettingError, match="mesh: expected one of ply, obj, glb, got 'stl'"):
+        run(made[0] / "plant.ply", tmp_path, units="cm", up="z", meshes=("stl",))
 
 
 def test_corrected_labels_are_taken_over(made, tmp_path, monkeypatch):

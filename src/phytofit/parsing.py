@@ -40,7 +40,7 @@ def parse_points(points: ArrayLike) -> FloatArray:
     except (TypeError, ValueError):
         rows = np.empty((0, 0))
     if rows.ndim != 2 or rows.shape[1] != 3 or not np.isfinite(rows).all():
-        raise SettingError(f"seed_point: expected three numbers, or several times three, got {points!r}")
+        raise SettingError(f"seed_point: expected three finite numbers, or several times three, got {points!r}")
     return rows
 
 

@@ -92,3 +92,13 @@ def test_a_full_disk_behind_standard_output_is_one_line(tmp_path):
     assert done.stderr.startswith("error: standard output: No space left")
     assert len(done.stderr.splitlines()) == 1
     assert (tmp_path / "truth.csv").is_file()
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["--version"], ["fit", "--help"]])
+def test_help_on_a_full_disk_is_one_line(arguments):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "phytofit", *arguments], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert done.stderr.startswith("error: standard output: No space left")

@@ -96,6 +96,9 @@ class _Program(TyperGroup):
         except typer.TyperException as error:
             complain(of_usage(error))
             code = NOTHING_DONE
+        except OSError as error:  # where help can't be shown; commands say themselves what is wrong
+            complain(unforeseen(error))
+            code = NOTHING_DONE
         return sys.exit(code) if standalone else code
 
 

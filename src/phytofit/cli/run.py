@@ -17,6 +17,7 @@ from phytofit.cli.options import (
     CameraOption,
     DepthUnitOption,
     LabelsOption,
+    MeshOption,
     OutOption,
     PatternOption,
     PosesOption,
@@ -26,6 +27,7 @@ from phytofit.cli.options import (
     ThreadsOption,
     UnitsOption,
     UpOption,
+    WorkbookOption,
     only,
 )
 from phytofit.cli.progress import Items
@@ -80,6 +82,8 @@ def run_command(
     seed: Seed = RUN["seed"],
     threads: ThreadsOption = None,
     folder: OutOption = Path("plant"),
+    meshes: MeshOption = None,
+    workbook: WorkbookOption = False,
 ) -> None:
     """Measure all leaves of a plant, from depth images or from its cloud: reconstruct, segment, fit.
 
@@ -111,10 +115,11 @@ def run_command(
         "species": species,
         "seed": seed,
         "threads": threads,
+        "meshes": meshes or (),
     }
     with results_in(folder):
         print_skipped(skipped)
-        _run_all(plants, settings, folder)
+        _run_all(plants, settings, folder, workbook=workbook)
 
 
 def _plants(context: typer.Context, sources: list[str], folder: Path) -> tuple[list[Path], list[Path]]:
@@ -137,12 +142,12 @@ def _plants(context: typer.Context, sources: list[str], folder: Path) -> tuple[l
     return images, []
 
 
-def _run_all(plants: list[Path], settings: dict[str, Any], folder: Path) -> None:
+def _run_all(plants: list[Path], settings: dict[str, Any], folder: Path, *, workbook: bool) -> None:
     """Measure one plant after the other; what goes wrong with one does not keep the others from being measured."""
     import pandas as pd
 
     from phytofit.pipeline import run
-    from phytofit.results import result_names, write_table
+    from phytofit.results import read_table, result_names, write_table, write_workbook
 
     alone = len(plants) == 1
     items = Items(len(plants), "plant", in_stages=True)
@@ -167,6 +172,8 @@ def _run_all(plants: list[Path], settings: dict[str, Any], folder: Path) -> None
     if tables and not alone:
         write_table(folder / "traits.csv", pd.concat(tables))
         say(f"{len(tables) - n_without} of {len(plants)} plants measured: {folder / 'traits.csv'}")
+    if tables and workbook:
+        write_workbook(folder / "traits.xlsx", read_table(folder / "traits.csv"))
     n_measured = len(tables) - n_without
     raise typer.Exit(0 if n_measured == len(plants) else 1 if n_measured else 2)
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from phytofit.cloud.cloud import PointCloud, from_points
 from phytofit.cloud.encoding import content_fault, in_utf8
 from phytofit.cloud.faces import sampled
-from phytofit.cloud.table import COLOR, NORMAL, XYZ, Columns, FileError, Table, key_of, listed
+from phytofit.cloud.table import COLOR, NORMAL, XYZ, Columns, FileError, Table, key_of, listed, quoted
 from phytofit.errors import CloudError, SettingError
 from phytofit.silence import silenced
 from phytofit.text import one_line
@@ -139,10 +139,12 @@ def _columns(table: Table, label_property: str | None) -> tuple[Columns, str | N
     found = {name: table.column(name) for name in (*XYZ, *NORMAL, *COLOR)}
     labels = table.column(label_property) if label_property else None
     missing = [name for name in XYZ if found[name] is None]
-    if label_property not in (None, "label") and labels is None:
-        missing.append(str(label_property))
     if missing:
         raise FileError(f"no property {', '.join(missing)}, found {listed(table.names)}; name them so")
+    if label_property not in (None, "label") and labels is None:
+        raise FileError(
+            f"no property {quoted(label_property)} with labels, found {listed(table.names)}; choose one of these"
+        )
     columns = {name: pair[1] for name, pair in (found | {"label": labels}).items() if pair is not None}
     return columns, labels[0] if labels else None
 
@@ -152,7 +154,7 @@ def _file_bytes(path: Path) -> bytes:
     try:
         if path.is_file():
             return path.read_bytes()
-        found = "is a folder" if path.is_dir() else "no such file"
+        found = "is a folder" if path.is_dir() else "is a device or a pipe" if path.exists() else "no such file"
     except (OSError, ValueError, MemoryError) as error:
         raise CloudError(f"{shown}: can't be read ({one_line(error)}); check its permissions and its size") from error
     raise CloudError(f"{shown}: {found}, expected a file of points; check the path")

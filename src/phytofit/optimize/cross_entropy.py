@@ -72,8 +72,8 @@ class CrossEntropy:
         self.n_elite = int(np.ceil(round(elite_fraction * n_samples, 9)))  # 0.07 * 100 is 7, not a little more
         if self.n_elite < 2:
             raise SettingError(
-                f"samples: expected enough for two elite candidates, got {n_samples} samples "
-                f"with elite_fraction {elite_fraction:g}"
+                f"samples: expected {int(round(1 / elite_fraction, 9)) + 1} or more, of which two are the elite "
+                f"(elite_fraction {elite_fraction:g}), got {n_samples}"
             )
         self.space = space
         self.n_samples = n_samples

@@ -24,6 +24,7 @@ from phytofit.results import (
     LOG,
     OURS,
     check_made,
+    check_meshes,
     check_reconstruction,
     check_table,
     delete_made,
@@ -98,6 +99,7 @@ def run(
     species: Species | str = "sorghum",
     seed: int = 0,
     threads: int | None = None,
+    meshes: Sequence[str] = (),
     progress: Progress = lambda stage, done, total: None,
 ) -> PlantRun:
     """Measure all leaves of a plant, or of each of several plants in one cloud.
@@ -112,6 +114,7 @@ def run(
         :func:`phytofit.reconstruct`; or a cloud in `units`, with `up` where it is known
     labels : name of a property of the cloud that tells stem (1) and leaves (2..) instead of finding them, of one plant
     species, seed, threads : as for :func:`phytofit.fit`
+    meshes : formats in which the model of each leaf is written beside PLY: obj, glb
     progress : called with a stage, and how much of how much of it is done
 
     Raises InputError and NoStemError where nothing can be measured.  A leaf whose fit is refused keeps what its
@@ -128,12 +131,13 @@ def run(
     if source.is_dir():
         if camera is None:
             raise InputError(f"{source}: a folder of depth images needs its camera: a preset, or a TOML file")
-        how = {"camera": camera, "step_deg": step_deg, "unit": unit, "poses": poses, "pattern": pattern}
-        cloud_file, units, up = _reconstructed(source, folder, how, log), "cm", up or "z"
+        images = {"camera": camera, "step_deg": step_deg, "unit": unit, "poses": poses, "pattern": pattern}
+        cloud_file, units, up = _reconstructed(source, folder, images, log), "cm", up or "z"
     elif camera is not None:
         raise InputError(f"{source}: a camera is for a folder of depth images, and this is none")
     plants = _segmented(cloud_file, folder, {"name": name, "units": units, "up": up, "labels": labels}, log)
-    tables = _measured(plants, species, {"seed": seed, "threads": threads}, log)
+    how = {"seed": seed, "threads": threads}
+    tables = _measured(plants, species, how, check_meshes(meshes), log)
     whole = pd.concat(tables, ignore_index=True)
     write_table(folder / "traits.csv", whole)
     _forget_others(folder, plants)
@@ -287,7 +291,9 @@ def _forget_others(folder: Path, plants: list[_Plant]) -> None:
                     delete_made(old)
 
 
-def _measured(plants: list[_Plant], species: Species, how: Mapping[str, Any], log: _Log) -> list[pd.DataFrame]:
+def _measured(
+    plants: list[_Plant], species: Species, how: Mapping[str, Any], meshes: Sequence[str], log: _Log
+) -> list[pd.DataFrame]:
     """The traits of all plants, their leaves fitted one after the other."""
     tables, n_leaves, n_done = [], sum(len(plant.found.leaves) for plant in plants), 0
     for plant in plants:
@@ -295,7 +301,7 @@ def _measured(plants: list[_Plant], species: Species, how: Mapping[str, Any], lo
         tables.append(trait_table(name, plant_traits(plant.found), plant=plant.number))
         for leaf, phytomer in zip(plant.found.leaves, plant.found.phytomers(), strict=True):
             log.progress("fit", n_done, n_leaves)
-            table = _fitted(plant, leaf, phytomer, species, how, log)
+            table = _fitted(plant, leaf, phytomer, species, how, meshes, log)
             tables.append(of_leaf(table, name, plant.number, leaf.rank))
             n_done += 1
     log.progress("fit", n_leaves, n_leaves)
@@ -303,14 +309,20 @@ def _measured(plants: list[_Plant], species: Species, how: Mapping[str, Any], lo
 
 
 def _fitted(
-    plant: _Plant, leaf: SegmentedLeaf, phytomer: PointCloud, species: Species, how: Mapping[str, Any], log: _Log
+    plant: _Plant,
+    leaf: SegmentedLeaf,
+    phytomer: PointCloud,
+    species: Species,
+    how: Mapping[str, Any],
+    meshes: Sequence[str],
+    log: _Log,
 ) -> pd.DataFrame:
     """The traits of one leaf, by its fit; where that is refused, its length along its points."""
     name = f"leaf_{leaf.rank:02d}"
     target = plant.place / "leaves" / name
     segmented = [plant.place / "segmentation" / file for file in MADE]
     acting = {step: settings for step, settings in recipe().items() if step not in ("reconstruct", "segment")}
-    key = key_of(name, segmented, {**acting, "species": _content(species), "seed": how["seed"]})
+    key = key_of(name, segmented, {**acting, "species": _content(species), "seed": how["seed"], "meshes": meshes})
     if up_to_date(target, key):
         log.skipped.append(f"{plant.called}{name}")
     else:
@@ -320,7 +332,7 @@ def _fitted(
             outliers = float(fitted.estimate.share[2])
             if outliers > MOST_OUTLIERS:
                 raise NoPhytomerError(f"the model does not explain {100 * outliers:.0f} % of the points")
-            save_fit(fitted, phytomer, target.parent, name)
+            save_fit(fitted, phytomer, target.parent, name, meshes=meshes)
             done(target, key, ("traits.csv",))
         except (NoPhytomerError, CloudError) as error:
             _save_by_points(plant, leaf, str(error), target, key)
