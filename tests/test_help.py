@@ -45,6 +45,13 @@ def test_help_imports_nothing_slow():
     assert all(f"phytofit {name} " in done.stdout.replace("-c ", "phytofit ") for name in COMMANDS)
 
 
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_flag_does_not_look_as_if_it_took_a_value(name):
+    said = help_of(name)
+    assert "--quiet -q Show" in said
+    assert "bool" not in said.replace("--help -h <bool>", "")  # that of typer itself
+
+
 @pytest.mark.long  # and on a machine that does nothing else
 def test_help_takes_less_than_half_a_second():
     """Of the processor; the least of five, since what else runs on the machine adds to it."""

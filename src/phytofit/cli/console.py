@@ -122,7 +122,8 @@ def _show_version(wanted: bool) -> None:
 def program(
     context: typer.Context,
     version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+        bool,
+        typer.Option("--version", metavar="", callback=_show_version, is_eager=True, help="Show the version and exit."),
     ] = False,
 ) -> None:
     """Plant traits from 3D point clouds, by fitting parametric plant models.
@@ -138,10 +139,16 @@ def program(
 
 
 QuietOption = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Show nothing but errors; results and log are written all the same.")
+    bool,
+    typer.Option(
+        "--quiet", "-q", metavar="", help="Show nothing but errors; results and log are written all the same."
+    ),
 ]
 VerboseOption = Annotated[
-    bool, typer.Option("--verbose", "-v", help="Show the warnings of libraries, and where in the code a fault arose.")
+    bool,
+    typer.Option(
+        "--verbose", "-v", metavar="", help="Show the warnings of libraries, and where in the code a fault arose."
+    ),
 ]
 
 

@@ -11,6 +11,7 @@ from phytofit.cli.each import measure_each
 from phytofit.cli.inputs import cloud_files
 from phytofit.cli.options import (
     MOST_POINTS,
+    STEMS_ABOVE,
     MeshOption,
     OutOption,
     Seed,
@@ -104,14 +105,16 @@ def fit_command(
         numeric(f"Generations of the search; by default {_by_method('n_generations')}.", least=1, most=10_000),
     ] = None,
     random_start: Annotated[
-        bool, typer.Option("--random-start", help="Start from means drawn from the prior (Fig. 7d of the paper).")
+        bool,
+        typer.Option(
+            "--random-start", metavar="", help="Start from means drawn from the prior (Fig. 7d of the paper)."
+        ),
     ] = FIT["random_start"],
     stem_above: Annotated[
         str | None,
         choice(
-            f"The stem above the leaf, {', '.join(STEM_ABOVE)}: as long as below it, not there, of a length of its "
-            f"own; by default {_by_method('stem_above')}. Without a length of its own the model has the paper's six "
-            "parameters.",
+            f"{STEMS_ABOVE}; by default {_by_method('stem_above')}. Without a length of its own the model has the "
+            "paper's six parameters.",
             among=STEM_ABOVE,
         ),
     ] = None,
@@ -128,7 +131,7 @@ def fit_command(
     meshes: MeshOption = None,
     workbook: WorkbookOption = False,
     convergence: Annotated[
-        bool, typer.Option("--convergence", help="Write convergence.png as well: how the search went.")
+        bool, typer.Option("--convergence", metavar="", help="Write convergence.png as well: how the search went.")
     ] = False,
 ) -> None:
     """Measure phytomers: one leaf on its piece of stem in each cloud, in any orientation.

@@ -15,6 +15,7 @@ from phytofit.errors import SettingError
 from phytofit.text import one_line
 
 __all__ = [
+    "STEMS_ABOVE",
     "CameraOption",
     "DepthUnitOption",
     "LabelsOption",
@@ -100,6 +101,7 @@ UNITS = [*entries_of("cloud.units", "SCALE_CM")]
 DEPTH_UNITS = [unit for unit in UNITS if unit != "none"]
 SPECIES = species_names()
 MESHES = value_of("results.models", "MESHES")
+STEMS_ABOVE = "The stem above the leaf: equal (as long as below it), none (not there) or free (of a length of its own)"
 
 Seed = Annotated[int, numeric("The same seed gives the same result.", least=0, most=MOST_SEED)]
 SpeciesOption = Annotated[
@@ -129,13 +131,13 @@ UpOption = Annotated[
 MeshOption = Annotated[
     list[str] | None,
     choice(
-        f"Write the model also as {', '.join(MESHES)}; repeat the option for more. In OBJ and GLB each organ "
-        "is a named part.",
+        f"Write the model as {' or '.join(MESHES[1:])} beside {MESHES[0]}; repeat the option for both. In OBJ and "
+        "GLB each organ is a named part.",
         "--mesh",
         among=MESHES,
     ),
 ]
-WorkbookOption = Annotated[bool, typer.Option("--xlsx", help="Write the table as traits.xlsx too.")]
+WorkbookOption = Annotated[bool, typer.Option("--xlsx", metavar="", help="Write the table as traits.xlsx too.")]
 OutOption = Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")]
 NoiseOption = Annotated[float, numeric("Standard deviation of the noise of each coordinate, cm.", least=0)]
 NoiseReachOption = Annotated[

@@ -11,6 +11,7 @@ from phytofit.cli.console import command, results_in, say
 from phytofit.cli.messages import meant
 from phytofit.cli.options import (
     MOST_POINTS,
+    STEMS_ABOVE,
     NoiseOption,
     NoiseReachOption,
     OutliersOption,
@@ -54,7 +55,7 @@ def simulate_command(
     stem_above: Annotated[
         str,
         choice(
-            f"The stem above the leaf: {', '.join(STEM_ABOVE)}: as long as below it, not there, or drawn too.",
+            f"{STEMS_ABOVE}.",
             among=STEM_ABOVE,
         ),
     ] = SIMULATE["stem_above"],
@@ -68,7 +69,7 @@ def simulate_command(
     sphere_diameter: SphereDiameterOption = SIMULATE["sphere_diameter_cm"],
     outliers: OutliersOption = SIMULATE["outlier_share"],
     upright: Annotated[
-        bool, typer.Option("--upright", help="Stem along +z, leaf towards +x; else a random pose.")
+        bool, typer.Option("--upright", metavar="", help="Stem along +z, leaf towards +x; else a random pose.")
     ] = False,
     seed: Seed = SIMULATE["seed"],
 ) -> None:

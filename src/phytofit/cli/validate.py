@@ -51,7 +51,8 @@ SPECIES = defaults_of("species", "load_species")["species"]
 def validate_command(
     context: typer.Context,
     results: Annotated[
-        Path | None, typer.Argument(help="Folder of results of phytofit fit, or its traits.csv.", show_default=False)
+        Path | None,
+        typer.Argument(help="Folder of results of phytofit fit or run, or a traits.csv or .xlsx.", show_default=False),
     ] = None,
     truth: Annotated[
         Path | None,
@@ -60,7 +61,8 @@ def validate_command(
         ),
     ] = None,
     simulated: Annotated[
-        bool, typer.Option("--simulate", help="Simulate phytomers and your sensor instead of reading results.")
+        bool,
+        typer.Option("--simulate", metavar="", help="Simulate phytomers and your sensor instead of reading results."),
     ] = False,
     points: Annotated[
         int, numeric("Number of points that your sensor records on a phytomer.", least=1, most=MOST_POINTS)
@@ -85,7 +87,8 @@ def validate_command(
 
     With --truth: results beside hand measures; bias, errors, correlation, concordance, limits of agreement, coverage.
     With --simulate: phytomers drawn from the species' ranges, scanned with your noise, points, cameras and occlusion,
-    and fitted; the same numbers, and how many points and how many cameras you need.
+    and fitted; the same numbers, and how many points and how many cameras you need. The options from --points to
+    --threads are for --simulate.
 
     Prints a table and writes DIR/validation.html (the same with plots, in one file), DIR/validation.csv (the
     statistics) and DIR/pairs.csv (each cloud and trait); with --simulate also DIR/needs.csv.
