@@ -30,7 +30,7 @@ def is_number(word: str) -> bool:
 
 def plain_nan(text: str) -> str:
     """The text with ``nan`` for the spellings of it that not every reader knows."""
-    return NAN_OF_OTHERS.sub("nan", text)
+    return NAN_OF_OTHERS.sub("nan", text) if any(sign in text for sign in "nN#*∞") else text  # most have none
 
 
 def numbers(words: Sequence[bytes]) -> NDArray[np.float64]:
