@@ -183,7 +183,7 @@ def test_meshes_and_a_workbook_are_written_where_they_are_asked_for(made, first_
     table = pd.read_csv(tmp_path / "traits.csv")
     assert pd.read_excel(tmp_path / "traits.xlsx")["value"].tolist() == pytest.approx(table["value"].tolist())
     with pytest.raises(SettingError, match="mesh: expected one of ply, obj, glb, got 'stl'"):
-        run(made[0] / "plant.ply", tmp_path, units="cm", up="z", meshes=("stl",))
+        run(made[0] / "plant.ply", tmp_path, units="cm", up="z", meshes="stl")
 
 
 def test_corrected_labels_are_taken_over(made, tmp_path, monkeypatch):

@@ -99,7 +99,7 @@ def run(
     species: Species | str = "sorghum",
     seed: int = 0,
     threads: int | None = None,
-    meshes: Sequence[str] = (),
+    meshes: str | Sequence[str] = (),
     progress: Progress = lambda stage, done, total: None,
 ) -> PlantRun:
     """Measure all leaves of a plant, or of each of several plants in one cloud.
@@ -120,7 +120,7 @@ def run(
     Raises InputError and NoStemError where nothing can be measured.  A leaf whose fit is refused keeps what its
     segmentation tells.
     """
-    source, folder = Path(source), Path(folder)
+    source, folder, meshes = Path(source), Path(folder), check_meshes(meshes)
     if source.is_dir() and source.resolve() == folder.resolve():
         raise InputError(f"{folder}: the folder of the images can't hold the results; choose another folder")
     name = source.resolve().stem if source.is_file() else source.resolve().name
@@ -137,7 +137,7 @@ def run(
         raise InputError(f"{source}: a camera is for a folder of depth images, and this is none")
     plants = _segmented(cloud_file, folder, {"name": name, "units": units, "up": up, "labels": labels}, log)
     how = {"seed": seed, "threads": threads}
-    tables = _measured(plants, species, how, check_meshes(meshes), log)
+    tables = _measured(plants, species, how, meshes, log)
     whole = pd.concat(tables, ignore_index=True)
     write_table(folder / "traits.csv", whole)
     _forget_others(folder, plants)

@@ -19,8 +19,9 @@ __all__ = ["MESHES", "check_meshes", "write_mesh"]
 MESHES = ("ply", "obj", "glb")
 
 
-def check_meshes(kinds: Sequence[str]) -> tuple[str, ...]:
-    """The kinds, each once; SettingError if one is not among `MESHES`."""
+def check_meshes(kinds: str | Sequence[str]) -> tuple[str, ...]:
+    """The kinds, or the one, each once; SettingError if one is not among `MESHES`."""
+    kinds = [kinds] if isinstance(kinds, str) else kinds
     for kind in kinds:
         if kind not in MESHES:
             raise SettingError(f"mesh: expected one of {', '.join(MESHES)}, got {one_line(kind)!r}")
