@@ -137,6 +137,11 @@ TEXT = {
     ),
     "a line under the names": Dialect(".txt", lambda p: text(p, head="x y z\n-----------\ncm cm cm\n"), unit="cm"),
     "files joined": Dialect(".csv", lambda p: text(p[:50], ",", head="x,y,z\n") + text(p[50:], ",", head="x,y,z\n")),
+    "files joined, each with a mark": Dialect(
+        ".csv", lambda p: b"".join(text(part, ",", head="\ufeffx,y,z\n") for part in (p[:50], p[50:]))
+    ),
+    "pages and DOS's end of a file": Dialect(".txt", lambda p: text(p[:50]) + b"\f\n" + text(p[50:]) + b"\x1a"),
+    "Fortran": Dialect(".txt", lambda p: text(p, number=lambda v: f"{v:.16E}".replace("E", "D"))),
     "PTS": Dialect(".pts", lambda p: text(p, head=f"{len(p)}\n", more=" -1200 255 0 0")),
     "PTS in TXT": Dialect(".txt", lambda p: text(p, head=f"{len(p)}\r\n", more=" -700", end="\r\n")),
     "PTS of scans": Dialect(".pts", lambda p: scans(p, more=" -1200 255 0 0")),

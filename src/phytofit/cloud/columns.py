@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from phytofit.cloud.encoding import decoded
-from phytofit.cloud.numerals import MISSING, is_number, plain_nan
+from phytofit.cloud.numerals import MISSING, is_number, plain_numbers
 from phytofit.cloud.table import COLOR, NORMAL, XYZ, FileError, Table, keys_of, listed, names_points, quoted
 
 __all__ = ["read"]
@@ -49,7 +49,7 @@ def read(data: bytes, wanted: Collection[str]) -> Table:
     if ";" not in text:
         text = text.replace("|", ";")
     head = _head(text)
-    separator, body = _with_decimal_points(plain_nan(COMMENT.sub("", text[head.start :])))
+    separator, body = _with_decimal_points(plain_numbers(COMMENT.sub("", text[head.start :])))
     n_most = _n_columns(body, separator)
     body = _without_trailing(body, separator)
     n_columns = _n_columns(body, separator)
@@ -117,7 +117,7 @@ def _head(text: str) -> _Head:
 
 def _is_row(line: str) -> bool:
     """Whether a line begins with three numbers, some of which may be missing."""
-    words = re.split(r"[;,\s]+", plain_nan(line).replace('"', ""), maxsplit=3)[:3]
+    words = re.split(r"[;,\s]+", plain_numbers(line).replace('"', ""), maxsplit=3)[:3]
     return any(words) and all(is_number(word) or word.lower() in MISSING for word in words)
 
 

@@ -14,7 +14,11 @@ MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16-le"),
     (codecs.BOM_UTF16_BE, "utf-16-be"),
 )
-OF_TYPESETTERS = dict.fromkeys(map(ord, "\u00a0\u2009\u202f\u3000"), " ") | {ord("\u2212"): "-"}  # blanks and minus
+OF_OTHER_TIMES = {0x1A: None, 0x0C: "\n"}  # the end of a file in DOS, and of a page
+OF_TYPESETTERS = dict.fromkeys(map(ord, "\u00a0\u2009\u202f\u3000"), " ") | {
+    ord("\u2212"): "-",
+    0xFEFF: None,
+}  # blanks, minus, mark
 SAMPLE = 400  # bytes by which UTF-16 without a mark is told: one half of each character is zero in most
 CONTENTS = (  # what a file is whose first bytes are these, and the suffixes that it may have, if it is a cloud
     (rb"\x00\x05\x16\x07", "a macOS resource file that lies beside the cloud, not a cloud; leave it out", ()),
@@ -64,6 +68,8 @@ def decoded(data: bytes) -> str:
             continue
         break
     plain = text if text.isascii() else text.translate(OF_TYPESETTERS)
+    if any(chr(sign) in plain for sign in OF_OTHER_TIMES):
+        plain = plain.translate(OF_OTHER_TIMES)
     return plain.replace("\r\n", "\n").replace("\r", "\n")
 
 

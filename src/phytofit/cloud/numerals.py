@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from phytofit.cloud.table import FileError, quoted
 
-__all__ = ["MISSING", "NUMBER", "is_number", "numbers", "plain_nan"]
+__all__ = ["MISSING", "NUMBER", "is_number", "numbers", "plain_numbers"]
 
 NUMBER = re.compile(r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 MISSING = frozenset(
@@ -19,6 +19,7 @@ MISSING = frozenset(
 )
 """Words that stand for no number, in lower case."""
 NOT_FINITE = re.compile(r"[-+]?(?:[qs]?nan(?:\(\w*\))?|inf(?:inity)?|∞|1[.,]#[a-z]+\d*)|\*+", re.IGNORECASE)
+DOUBLE = re.compile(r"(?<=[\d.])D(?=[-+]\d)")  # 1.5D+00
 # 1.#QNAN and nan(ind) of compilers, and the stars of a number that was too wide for its place
 NAN_OF_OTHERS = re.compile(r"[-+]?(?:\bnan\(\w*\)|\b[qs]?nan\b|∞|\b1[.,]#[a-z]+\d*)|\*{2,}", re.IGNORECASE)
 
@@ -28,8 +29,10 @@ def is_number(word: str) -> bool:
     return bool(NUMBER.fullmatch(word) or NOT_FINITE.fullmatch(word))
 
 
-def plain_nan(text: str) -> str:
-    """The text with ``nan`` for the spellings of it that not every reader knows."""
+def plain_numbers(text: str) -> str:
+    """The text with ``nan`` for the spellings of it that not every reader knows, and with E for Fortran's D."""
+    if "D" in text:
+        text = DOUBLE.sub("E", text)
     return NAN_OF_OTHERS.sub("nan", text) if any(sign in text for sign in "nN#*∞") else text  # most have none
 
 
