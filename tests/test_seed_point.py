@@ -196,7 +196,7 @@ def test_two_pieces_of_a_leaf(crowded):
 
 @pytest.mark.parametrize("wrong", ["abc", [1.0, 2.0], [[1.0, 2.0, np.nan]], [[[1.0, 2.0, 3.0]]]])
 def test_what_is_no_point_is_refused(crowded, wrong):
-    with pytest.raises(phytofit.SettingError, match="seed_point: expected three numbers"):
+    with pytest.raises(phytofit.SettingError, match="seed_point: expected three finite numbers"):
         phytofit.fit(crowded[0].points, "cm", seed_point=wrong)
 
 
