@@ -12,8 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 import phytofit
-import phytofit.pose
-import phytofit.preparation
+import phytofit.start
 
 SPECIES = phytofit.load_species()
 LEAF_CM = float(SPECIES.space.mean[SPECIES.space.index("leaf_length")])  # to which leaves are scaled
@@ -32,7 +31,7 @@ class Leaf(NamedTuple):
     name: str
     points: np.ndarray
     organ: np.ndarray | None
-    starts: list[phytofit.pose.StartPose]
+    starts: list[phytofit.start.StartPose]
 
 
 class Plant(NamedTuple):
@@ -61,7 +60,7 @@ def single_leaves(n_points: int) -> Iterator[Leaf]:
     """The paper's real clouds: not labelled, a leaf on its piece of stem each, y is up."""
     for path in clouds("greenhouse", "field"):
         up = np.array([0.0, 1.0, 0.0])
-        found = phytofit.preparation.prepare(read(path), SPECIES, n_points=n_points, up=up, with_outliers=True)
+        found = phytofit.start.prepare(read(path), SPECIES, n_points=n_points, up=up, with_outliers=True)
         yield Leaf(path.parent.name, path.stem, path.stem, found.points, None, found.starts)
 
 
@@ -124,7 +123,7 @@ def cut_leaf(plant: Plant, label: int, n_points: int) -> Leaf | None:
     pose[:3, :3], pose[:3, 3] = np.stack([side, np.cross(axis, side), axis], axis=1), middle
     foot, top = np.quantile(height, [0.01, 0.99])
     radius = np.median(np.linalg.norm(across - middle, axis=1))
-    start = phytofit.pose.StartPose(pose, float(foot), float(top), float(radius), curl=0.0, score=0.0)
+    start = phytofit.start.StartPose(pose, float(foot), float(top), float(radius), curl=0.0, score=0.0)
     return Leaf(plant.data_set, plant.plant, f"{plant.name} leaf {label - 1}".strip(), both[kept], organ[kept], [start])
 
 

@@ -40,13 +40,21 @@ from cut_leaves import Leaf, leaves
 from scipy.special import log_ndtr
 
 import phytofit
-from phytofit.dependence import score_dependence
+from phytofit.engine.dependence import score_dependence
+from phytofit.engine.holes import find_holes
+from phytofit.engine.likelihood import (
+    N_EXTRA,
+    NO_THICKNESS_CM,
+    NOISE_CM,
+    NOISE_FACTOR,
+    THICKNESS,
+    CloudLikelihood,
+    State,
+)
+from phytofit.engine.scoring import refine
+from phytofit.engine.search import estimate
+from phytofit.engine.visibility import Hidden
 from phytofit.fitting import mean_at
-from phytofit.hidden import Hidden
-from phytofit.holes import find_holes
-from phytofit.likelihood import N_EXTRA, NO_THICKNESS_CM, NOISE_CM, NOISE_FACTOR, THICKNESS, CloudLikelihood, State
-from phytofit.optimize import refine
-from phytofit.posterior import estimate
 
 SPECIES = phytofit.load_species()
 K = len(SPECIES.space)

@@ -4,7 +4,7 @@
 
 No ruler has a part in it: of all labelled leaves in ../shared/data (and the paper's clouds, which are one leaf each),
 cut out with their piece of stem, both ends are told, and how much they differ beyond their errors.  That is what
-`phytofit.leaf_end.MISFIT` rests on.
+`phytofit.engine.leaf_end.MISFIT` rests on.
 """
 
 import argparse
@@ -22,9 +22,9 @@ from common import DATA, progress
 from cut_leaves import SPECIES, Leaf, leaves
 from scipy.optimize import minimize_scalar
 
-from phytofit import leaf_end
+from phytofit.engine import leaf_end
+from phytofit.engine.search import estimate
 from phytofit.fitting import N_SEARCHED, mean_at
-from phytofit.posterior import estimate
 
 
 def ends_of(leaf: Leaf) -> tuple[float, float] | None:

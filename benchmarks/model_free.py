@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 import phytofit
-import phytofit.preparation
+import phytofit.start
 from phytofit.traits import CHORD_CM
 
 N_POINTS = 5000
@@ -35,7 +35,7 @@ def measure(points: np.ndarray, seed_point: np.ndarray | None = None) -> dict[st
     Raises NoPhytomerError where no stem is found.
     """
     cloud, seeds = phytofit.from_points(points, "cm"), None if seed_point is None else np.atleast_2d(seed_point)
-    found = phytofit.preparation.prepare(cloud, phytofit.load_species(), n_points=N_POINTS, seed_points=seeds)
+    found = phytofit.start.prepare(cloud, phytofit.load_species(), n_points=N_POINTS, seed_points=seeds)
     start = found.starts[0]
     upright = (found.points - start.pose[:3, 3]) @ start.pose[:3, :3]
     rho = np.hypot(upright[:, 0], upright[:, 1])

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 import phytofit
 import phytofit.simulation
 from phytofit.cloud import size_cm
-from phytofit.flags import UNUSABLE
+from phytofit.results.remarks import UNUSABLE
 from phytofit.simulation import random_pose
 
 SPECIES = phytofit.load_species()

@@ -36,16 +36,15 @@ import numpy as np
 from peers import Peer, open3d_peer, placed, scipy_peer, small_gicp_peer, yardstick
 
 import phytofit
-import phytofit.distances
 import phytofit.models
-import phytofit.objectives
-import phytofit.optimize
-import phytofit.preparation
-from phytofit import distances, objectives
+import phytofit.paper
+import phytofit.start
 from phytofit.fitting import mean_at
 from phytofit.kernels.distance import hausdorff
 from phytofit.kernels.icp import icp, transform
 from phytofit.kernels.nearest import NearestGrid
+from phytofit.paper import distances
+from phytofit.paper import objective as objectives
 from phytofit.simulation import random_pose
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "sodhi2018"
@@ -65,26 +64,26 @@ BYTES_A_LOOK_UP = 12 + 4 + 16  # the source point, the cell's index, the padded 
 class Task(NamedTuple):
     """A cloud as :func:`phytofit.fit` searches on it: upright and thinned, with its start poses and first mean."""
 
-    reference: phytofit.distances.Reference
+    reference: phytofit.paper.Reference
     starts: list[np.ndarray]
     mean: np.ndarray
 
-    def objective(self, n_points: int, executor: Executor | None = None) -> phytofit.objectives.PaperObjective:
-        return phytofit.objectives.PaperObjective(
+    def objective(self, n_points: int, executor: Executor | None = None) -> phytofit.paper.PaperObjective:
+        return phytofit.paper.PaperObjective(
             SPECIES.model, self.reference, starts=self.starts, n_points=n_points, executor=executor
         )
 
-    def search(self, n_samples: int, n_generations: int = 10) -> phytofit.optimize.CrossEntropy:
-        return phytofit.optimize.CrossEntropy(
+    def search(self, n_samples: int, n_generations: int = 10) -> phytofit.paper.CrossEntropy:
+        return phytofit.paper.CrossEntropy(
             SPECIES.space, n_samples=n_samples, n_generations=n_generations, mean=self.mean
         )
 
 
 def task_of(points: np.ndarray, n_points: int) -> Task:
     """What `phytofit.fit` does to a cloud (n, 3), cm, before it searches."""
-    found = phytofit.preparation.prepare(phytofit.from_points(points, "cm"), SPECIES, n_points=n_points)
+    found = phytofit.start.prepare(phytofit.from_points(points, "cm"), SPECIES, n_points=n_points)
     return Task(
-        phytofit.distances.Reference.of(found.points),
+        phytofit.paper.Reference.of(found.points),
         [start.pose for start in found.starts],
         mean_at(found.starts[0], SPECIES),
     )
@@ -129,7 +128,7 @@ def table1(samples: tuple[int, ...] = (100, 500, 1000), sizes: tuple[int, ...] =
                 with ThreadPoolExecutor(threads) as executor:
                     search, objective = task.search(n_samples), task.objective(n_points, executor)
                     start = time.perf_counter()
-                    phytofit.objectives.minimise(search, objective)
+                    phytofit.paper.minimise(search, objective)
                     ours.append((time.perf_counter() - start) / search.n_generations)
             paper = PAPER.get((n_samples, n_points), np.nan)
             print(
@@ -141,7 +140,7 @@ def table1(samples: tuple[int, ...] = (100, 500, 1000), sizes: tuple[int, ...] =
 # Equal work
 
 
-def our_kernels(reference: phytofit.distances.Reference) -> Peer:
+def our_kernels(reference: phytofit.paper.Reference) -> Peer:
     """Our kernels as a peer: plain ICP on the grid, and the Hausdorff distance."""
 
     def align(points: np.ndarray, pose: np.ndarray, iterations: int) -> tuple[np.ndarray, int]:
@@ -356,8 +355,8 @@ def look_ups_at_most(task: Task, n: int) -> dict[str, float]:
 
     A Hausdorff distance counts as one look-up for each point of both clouds.
     """
-    settings = {name: p.default for name, p in inspect.signature(phytofit.objectives.PaperObjective).parameters.items()}
-    elite_fraction = inspect.signature(phytofit.optimize.CrossEntropy).parameters["elite_fraction"].default
+    settings = {name: p.default for name, p in inspect.signature(phytofit.paper.PaperObjective).parameters.items()}
+    elite_fraction = inspect.signature(phytofit.paper.CrossEntropy).parameters["elite_fraction"].default
     short = min(objectives.SHORTLIST * elite_fraction, 1.0)
     tilts = len(settings["tilts_deg"])
     scout = len(task.starts) * -(-n // settings["scout_stride"]) * settings["scout_iterations"]
@@ -376,7 +375,7 @@ def look_ups_made(task: Task, settings: dict[str, int]) -> dict[str, float]:
     n = settings["n_points"]
     search = task.search(settings["n_samples"], settings["n_generations"])
     with counted() as counts:
-        phytofit.objectives.minimise(search, task.objective(n))
+        phytofit.paper.minimise(search, task.objective(n))
     candidates = settings["n_samples"] * settings["n_generations"]
     by_size = sorted(size for size in counts if size != "Hausdorff")
     names = dict(zip(by_size, ("scout", "coarse", "fine")[-len(by_size) :], strict=True))

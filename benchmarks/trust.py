@@ -32,7 +32,7 @@ from scipy.spatial import cKDTree
 import phytofit
 import phytofit.models
 import phytofit.simulation
-from phytofit.likelihood import CloudLikelihood
+from phytofit.engine.likelihood import CloudLikelihood
 from phytofit.models.organs import frames_along
 
 SPECIES = phytofit.load_species()

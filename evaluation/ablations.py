@@ -10,12 +10,10 @@ from cmaes import CMA
 from scipy.optimize import differential_evolution
 
 import phytofit
-import phytofit.distances
 import phytofit.fitting
-import phytofit.objectives
-import phytofit.optimize
+import phytofit.paper
 import phytofit.parameters
-import phytofit.preparation
+import phytofit.start
 from evaluation.jobs import run_all
 from evaluation.settings import PAPERS, Budget
 from evaluation.tables import write_markdown, write_table
@@ -68,20 +66,20 @@ def ablated(what: str, number: int, settings: dict[str, int]) -> dict[str, Any]:
 
 def problem_of(
     points: np.ndarray, n_points: int
-) -> tuple[phytofit.parameters.ParameterSpace, np.ndarray, phytofit.objectives.PaperObjective]:
+) -> tuple[phytofit.parameters.ParameterSpace, np.ndarray, phytofit.paper.PaperObjective]:
     """What is searched: the space of Eq. (1), the mean to start from, and the paper's objective on a cloud (n, 3)."""
     species = PAPERS
-    found = phytofit.preparation.prepare(phytofit.from_points(points, "cm"), species, n_points=n_points)
-    objective = phytofit.objectives.PaperObjective(
+    found = phytofit.start.prepare(phytofit.from_points(points, "cm"), species, n_points=n_points)
+    objective = phytofit.paper.PaperObjective(
         species.model,
-        phytofit.distances.Reference.of(found.points),
+        phytofit.paper.Reference.of(found.points),
         starts=[start.pose for start in found.starts],
         n_points=n_points,
     )
     return species.space, phytofit.fitting.mean_at(found.starts[0], species), objective
 
 
-def traits_at(objective: phytofit.objectives.PaperObjective, x: np.ndarray) -> tuple[list[phytofit.Trait], float]:
+def traits_at(objective: phytofit.paper.PaperObjective, x: np.ndarray) -> tuple[list[phytofit.Trait], float]:
     organs = [organ.row(0) for organ in PAPERS.model.organs(x)]
     return phytofit.measure(organs), objective.register(x)[1]
 
@@ -98,7 +96,7 @@ def random_search(points: np.ndarray, settings: dict[str, int]) -> tuple[list[ph
     space, mean, objective = problem_of(points, settings["n_points"])
     best, least = mean, np.inf
     for seed in range(settings["n_generations"]):
-        xs = phytofit.optimize.CrossEntropy(space, n_samples=settings["n_samples"], mean=mean, seed=seed).ask()
+        xs = phytofit.paper.CrossEntropy(space, n_samples=settings["n_samples"], mean=mean, seed=seed).ask()
         errors = objective(xs, 1)
         if errors.min() < least:
             best, least = xs[np.argmin(errors)], errors.min()
@@ -109,7 +107,7 @@ def evolution(points: np.ndarray, settings: dict[str, int]) -> tuple[list[phytof
     """Differential evolution (SciPy's), its first generation drawn from the prior."""
     space, mean, objective = problem_of(points, settings["n_points"])
     box = box_of(space, mean)
-    first = phytofit.optimize.CrossEntropy(space, n_samples=settings["n_samples"], mean=mean).ask()
+    first = phytofit.paper.CrossEntropy(space, n_samples=settings["n_samples"], mean=mean).ask()
     found = differential_evolution(
         lambda columns: objective(np.ascontiguousarray(columns.T)),
         box,

@@ -8,12 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 import phytofit
-import phytofit.distances
 import phytofit.fitting
 import phytofit.models
-import phytofit.objectives
-import phytofit.optimize
-import phytofit.preparation
+import phytofit.paper
+import phytofit.start
 from evaluation.draw import BLACK, outline, save, side_of
 from evaluation.jobs import run_all
 from evaluation.settings import COLORS, NAMES, PAPERS, SPECIES, Budget, clouds, read
@@ -35,15 +33,15 @@ def search(path: Path | None, settings: dict[str, int]) -> dict[str, Any]:
     made = phytofit.simulate(stem_above="equal", seed=3)
     cloud = phytofit.from_points(made.points, "cm") if path is None else read(path)
     species = PAPERS
-    found = phytofit.preparation.prepare(cloud, species, n_points=settings["n_points"])
-    objective = phytofit.objectives.PaperObjective(
+    found = phytofit.start.prepare(cloud, species, n_points=settings["n_points"])
+    objective = phytofit.paper.PaperObjective(
         species.model,
-        phytofit.distances.Reference.of(found.points),
+        phytofit.paper.Reference.of(found.points),
         starts=[start.pose for start in found.starts],
         n_points=settings["n_points"],
     )
-    run = phytofit.objectives.minimise(
-        phytofit.optimize.CrossEntropy(
+    run = phytofit.paper.minimise(
+        phytofit.paper.CrossEntropy(
             species.space,
             n_samples=settings["n_samples"],
             n_generations=settings["n_generations"],

@@ -10,12 +10,10 @@ import numpy as np
 import pandas as pd
 
 import phytofit
-import phytofit.distances
 import phytofit.fitting
 import phytofit.models
-import phytofit.objectives
-import phytofit.optimize
-import phytofit.preparation
+import phytofit.paper
+import phytofit.start
 from benchmarks import peers
 from evaluation.jobs import run_all
 from evaluation.settings import PAPERS, Budget
@@ -57,7 +55,7 @@ def seconds(n_samples: int, n_points: int, n_generations: int, n_candidates: int
     many candidates, each with 50 rounds of ICP and the Hausdorff distance."""
     species = PAPERS
     cloud = phytofit.from_points(phytofit.simulate(n_points=n_points, seed=1).points, "cm")
-    found = phytofit.preparation.prepare(cloud, species, n_points=n_points)
+    found = phytofit.start.prepare(cloud, species, n_points=n_points)
     starts = [start.pose for start in found.starts]
     mean = phytofit.fitting.mean_at(found.starts[0], species)
     row: dict[str, float] = {
@@ -67,21 +65,21 @@ def seconds(n_samples: int, n_points: int, n_generations: int, n_candidates: int
     }
     for threads in (CORES, 1):
         with ThreadPoolExecutor(threads) as executor:
-            search = phytofit.optimize.CrossEntropy(
+            search = phytofit.paper.CrossEntropy(
                 species.space, n_samples=n_samples, n_generations=n_generations, mean=mean
             )
-            objective = phytofit.objectives.PaperObjective(
+            objective = phytofit.paper.PaperObjective(
                 species.model,
-                phytofit.distances.Reference.of(found.points),
+                phytofit.paper.Reference.of(found.points),
                 starts=starts,
                 n_points=n_points,
                 executor=executor,
             )
-            phytofit.objectives.minimise(
-                phytofit.optimize.CrossEntropy(species.space, n_samples=20, n_generations=1, mean=mean), objective
+            phytofit.paper.minimise(
+                phytofit.paper.CrossEntropy(species.space, n_samples=20, n_generations=1, mean=mean), objective
             )  # kernels compiled
             began = time.perf_counter()
-            phytofit.objectives.minimise(search, objective)
+            phytofit.paper.minimise(search, objective)
             row["all threads" if threads == CORES and "all threads" not in row else "one thread"] = (
                 time.perf_counter() - began
             ) / n_generations

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 
 import phytofit
+import phytofit.io
 import phytofit.models
-import phytofit.results
 from benchmarks import model_free
 from evaluation.jobs import run_all
 from evaluation.settings import NAMES, Budget, clouds, read
@@ -161,4 +161,4 @@ def real(budget: Budget, out: Path) -> None:
 
 def real_fit(method: str, path: Path, settings: dict[str, int]) -> pd.DataFrame:
     result = phytofit.fit(read(path), method=method, threads=1, **settings)
-    return phytofit.results.trait_table(path.stem, result.traits)
+    return phytofit.io.trait_table(path.stem, result.traits)

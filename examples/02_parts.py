@@ -9,11 +9,9 @@ import numpy as np
 
 import phytofit
 import phytofit.cloud
-import phytofit.distances
 import phytofit.models
-import phytofit.objectives
-import phytofit.optimize
-import phytofit.pose
+import phytofit.paper
+import phytofit.start
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--quick", action="store_true", help="small settings: shows that it runs, measures badly")
@@ -28,16 +26,16 @@ print(f"{len(points)} of {len(cloud)} points are no outliers")
 
 # 2. Where the stem stands and on which side the leaf is.
 species = phytofit.load_species("sorghum").leading(7)  # Eq. (1), and the stem above the leaf
-start = phytofit.pose.start_poses(points, stem_radius=2.7, up=np.array([0.0, 0.0, 1.0]))[0]
+start = phytofit.start.start_poses(points, stem_radius=2.7, up=np.array([0.0, 0.0, 1.0]))[0]
 print(f"a stem of {2 * start.radius:.1f} cm, from {-start.foot:.1f} cm below the leaf to {start.top:.1f} cm above it")
 
 # 3. The reference, seen from there: thinned, with its search structures.
 rotation, place = start.pose[:3, :3], start.pose[:3, 3]
 upright = (points - place) @ rotation
-reference = phytofit.distances.Reference.of(upright[phytofit.cloud.thin(upright, n_points)])
+reference = phytofit.paper.Reference.of(upright[phytofit.cloud.thin(upright, n_points)])
 
 # 4. The objective: candidates -> organs -> points -> ICP -> distance.
-objective = phytofit.objectives.PaperObjective(species.model, reference, n_points=n_points)
+objective = phytofit.paper.PaperObjective(species.model, reference, n_points=n_points)
 
 # 5. The search, from the prior with the stem's lengths as they were just seen.
 space = species.space
@@ -45,8 +43,8 @@ mean = space.mean
 mean[space.index("stem_length")] = np.clip(-start.foot, 1.0, None)
 mean[space.index("stem_length_above")] = np.clip(start.top, 0.0, None)
 settings = {"n_samples": 60, "n_generations": 3} if quick else {}
-search = phytofit.optimize.CrossEntropy(space, mean=mean, seed=0, **settings)
-phytofit.objectives.minimise(
+search = phytofit.paper.CrossEntropy(space, mean=mean, seed=0, **settings)
+phytofit.paper.minimise(
     search,
     objective,
     progress=lambda g: print(f"generation {g.index}: best {g.best_error:.2f} cm, elite within {g.threshold:.2f} cm"),

@@ -1,4 +1,4 @@
-"""A distance of your own: register it in phytofit.distances.DISTANCES and fit with it.
+"""A distance of your own: register it in phytofit.paper.DISTANCES and fit with it.
 
 A distance is made for one reference cloud, once a fit, and then called for every candidate.  This one is the mean
 distance, both ways, in which no point counts for more than 2 cm: a few stray points can't decide it.
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 import phytofit
-import phytofit.distances
+import phytofit.paper
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--quick", action="store_true", help="small settings: shows that it runs, measures badly")
@@ -35,7 +35,7 @@ def truncated(reference, most_cm=2.0):
     return distance
 
 
-phytofit.distances.DISTANCES["truncated"] = truncated
+phytofit.paper.DISTANCES["truncated"] = truncated
 # end of the distance
 
 made = phytofit.simulate(outlier_share=0.05, seed=3)

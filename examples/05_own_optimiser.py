@@ -1,6 +1,6 @@
 """An optimiser of your own: CMA-ES of the package cmaes in place of the cross-entropy method.
 
-phytofit.objectives.minimise asks little of an optimiser: `done`, `ask()`, `tell(xs, errors)` and `n_elite`.  The
+phytofit.paper.minimise asks little of an optimiser: `done`, `ask()`, `tell(xs, errors)` and `n_elite`.  The
 objective knows nothing of optimisers, and the optimiser nothing of plants.  Needs the package: pip install cmaes
 """
 
@@ -11,9 +11,8 @@ import numpy as np
 
 import phytofit
 import phytofit.cloud
-import phytofit.distances
-import phytofit.objectives
-import phytofit.pose
+import phytofit.paper
+import phytofit.start
 
 try:
     from cmaes import CMA
@@ -64,13 +63,13 @@ class CmaSearch:
 
 made = phytofit.simulate(random_orientation=False, seed=1)
 species = phytofit.load_species("sorghum").leading(7)  # Eq. (1), and the stem above the leaf
-start = phytofit.pose.start_poses(made.points, stem_radius=2.7, up=np.array([0.0, 0.0, 1.0]))[0]
+start = phytofit.start.start_poses(made.points, stem_radius=2.7, up=np.array([0.0, 0.0, 1.0]))[0]
 upright = (made.points - start.pose[:3, 3]) @ start.pose[:3, :3]
-reference = phytofit.distances.Reference.of(upright[phytofit.cloud.thin(upright, n_points)])
-objective = phytofit.objectives.PaperObjective(species.model, reference, n_points=n_points)
+reference = phytofit.paper.Reference.of(upright[phytofit.cloud.thin(upright, n_points)])
+objective = phytofit.paper.PaperObjective(species.model, reference, n_points=n_points)
 
 search = CmaSearch(species.space, species.space.mean, n_samples, n_generations)
-phytofit.objectives.minimise(search, objective)
+phytofit.paper.minimise(search, objective)
 
 errors = [error for error, _ in search.history]
 print(f"best of generation 1: {errors[0]:.2f} cm; best of all {len(errors)}: {min(errors):.2f} cm")

@@ -18,24 +18,19 @@ LAYERS = [
     {"cli"},
     {"batch"},
     {"pipeline"},
-    {"results"},
     {"report", "viewer", "export"},
+    {"io"},
     {"plots"},
-    {"validation"},
-    {"recipe"},
-    {"fitting", "simulation", "reconstruct"},
-    {"fitted", "preparation", "posterior"},
-    {"meant", "outcome"},
-    {"segmentation"},
-    {"covariance", "refining"},
-    {"beginnings", "dependence", "holes", "leaf_end", "tip", "whole_pieces"},
-    {"flags"},
-    {"likelihood", "objectives", "pose"},
-    {"distances", "hidden"},
-    {"intervals", "optimize", "traits", "unexplained", "voids"},
+    {"recipe", "validation"},
+    {"fitting"},
+    {"results"},
+    {"engine", "paper"},
+    {"start"},
+    {"reconstruct", "segmentation", "simulation"},
+    {"traits"},
     {"species"},
     {"models"},
-    {"cloud"},
+    {"cloud", "geometry"},
     {"kernels"},
     {"display", "ordering", "parameters", "parsing", "small_files"},
     {"bundled", "errors", "silence", "text", "version"},
@@ -43,8 +38,8 @@ LAYERS = [
 DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}
 
 # A result's `plot` and `to_frame` import what stands above it when they are called, and only then.
-RESULTS = ("fitted.py", "segmentation/whole.py", "reconstruct/depth.py")
-SHOWS_ITSELF = {(file, part) for file in RESULTS for part in ("plots", "results")}
+RESULTS = ("results/fit.py", "segmentation/whole.py", "reconstruct/depth.py")
+SHOWS_ITSELF = {(file, part) for file in RESULTS for part in ("plots", "io")}
 
 # What a user needs; the rest is imported from its module.
 PUBLIC = """
@@ -111,7 +106,7 @@ def own(path):
         ("from . import nearest", {"phytofit.kernels"}),
         ("from .nearest import Bins", {"phytofit.kernels.nearest"}),
         ("from ..models import mesh", {"phytofit.models"}),
-        ("from .. import pose", {"phytofit.pose"}),
+        ("from .. import start", {"phytofit.start"}),
         ("def f():\n    if f:\n        from phytofit.cli import main", {"phytofit.cli"}),
     ],
 )
@@ -139,12 +134,12 @@ def test_results_import_what_shows_them_only_when_it_is_asked_for():
     for name in RESULTS:
         tree = ast.parse((SOURCE / name).read_text(encoding="utf-8"))
         at_once = {node.module for node in tree.body if isinstance(node, ast.ImportFrom)}
-        assert not at_once & {"phytofit.plots", "phytofit.results"}, name
+        assert not at_once & {"phytofit.plots", "phytofit.io"}, name
 
 
 def test_the_optimiser_has_never_heard_of_plants():
-    for path in (SOURCE / "optimize").glob("*.py"):
-        assert own(path) <= {"optimize", "errors", "parameters"}, path.name
+    for path in (SOURCE / "paper" / "cross_entropy.py", SOURCE / "engine" / "scoring.py"):
+        assert own(path) <= {"errors", "parameters"}, path.name
         assert third_party(path) <= {"numpy", "scipy"}, path.name
 
 
@@ -154,10 +149,10 @@ def test_kernels_know_numpy_only():
         assert third_party(path) <= ({"numpy", "numba"} if path.name == "compiling.py" else {"numpy"}), path.name
 
 
-def test_what_shows_results_never_sees_the_optimiser():
+def test_what_shows_results_never_sees_the_engine():
     for name in ("report", "viewer", "plots", "export"):
-        for path in [SOURCE / f"{name}.py", *(SOURCE / name).glob("*.py")]:
-            assert not path.exists() or not own(path) & {"optimize", "objectives"}, path.name
+        for path in (SOURCE / name).glob("*.py"):
+            assert not own(path) & {"engine", "paper"}, path.name
 
 
 def test_files_stay_short():

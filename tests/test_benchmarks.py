@@ -11,8 +11,8 @@ from scipy import integrate, stats
 from scipy.spatial import cKDTree
 
 import phytofit
-import phytofit.pose
-from phytofit.likelihood import Evaluation, State
+import phytofit.start.pose
+from phytofit.engine.likelihood import Evaluation, State
 from phytofit.models import move
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -259,7 +259,7 @@ def test_evidence_tells_a_parameter_that_is_there_from_one_that_is_not(monkeypat
     cut = []
     for seed, bend in enumerate((-25.0, -10.0, 12.0, 24.0)):
         made = phytofit.simulate(fixed={there: bend}, n_points=500, seed=seed)
-        start = phytofit.pose.StartPose(made.pose @ moved_up(made.x[1]), -made.x[1], made.x[6], 1.5, 0.0, 0.0)
+        start = phytofit.start.pose.StartPose(made.pose @ moved_up(made.x[1]), -made.x[1], made.x[6], 1.5, 0.0, 0.0)
         cut.append(evidence.Leaf("simulated", str(seed), "", made.points, (made.labels - 1).astype(np.int8), [start]))
     fits, found = evidence.study(cut, map)
     assert len(fits) == len(cut)

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 import phytofit
 from phytofit.cli import app
-from phytofit.results import COLUMNS, result_names
+from phytofit.io import COLUMNS, result_names
 
 FAST = ["--method", "paper", "--samples", "60", "--points", "500", "--generations", "3"]
 FILES = {"fit.json", "traits.csv", "model.ply", "fit.png"}

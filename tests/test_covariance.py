@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 import phytofit
-from phytofit.covariance import covariance_of, misfit_of, mixed
-from phytofit.dependence import NONE, Bell, Dependence, score_dependence
-from phytofit.likelihood import CloudLikelihood
-from phytofit.optimize import refine
-from phytofit.refining import refinement
+from phytofit.engine.covariance import covariance_of, misfit_of, mixed
+from phytofit.engine.dependence import NONE, Bell, Dependence, score_dependence
+from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.refine import refinement
+from phytofit.engine.scoring import refine
 
 SPECIES = phytofit.load_species()
 NAMES = SPECIES.space.names

@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from phytofit.errors import SettingError
-from phytofit.optimize import CrossEntropy
+from phytofit.paper.cross_entropy import CrossEntropy
 from phytofit.parameters import Parameter, ParameterSpace
 
 EXACT = 1e-12  # relative; two ways to sum a hundred numbers

@@ -5,10 +5,10 @@ import pytest
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from phytofit.dependence import NONE, Bell, _before_the_fit, _correlation, score_dependence, width_misfit
-from phytofit.likelihood import CloudLikelihood, State
+from phytofit.engine.dependence import NONE, Bell, _before_the_fit, _correlation, score_dependence, width_misfit
+from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.refine import refinement
 from phytofit.models import SurfaceSampler, move
-from phytofit.refining import refinement
 from phytofit.species import load_species
 
 SAME = 1e-9  # relative; sums in float64

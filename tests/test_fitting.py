@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 import phytofit
 import phytofit.models
-from phytofit import CloudError, NoPhytomerError, SettingError, SpeciesError, Status, UnitError, preparation
+from phytofit import CloudError, NoPhytomerError, SettingError, SpeciesError, Status, UnitError
+from phytofit.start import prepare as preparation
 
 SMALL = {"method": "paper", "n_samples": 120, "n_points": 800, "n_generations": 5, "threads": 2}
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "sodhi2018"

@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 import phytofit
 from phytofit.cli import app
 from phytofit.cli.settings import defaults_of, entries_of
-from phytofit.distances import DISTANCES
 from phytofit.fitting import METHODS, fit
+from phytofit.paper.distances import DISTANCES
 from phytofit.parsing import AXES
 from phytofit.pipeline import run
 from phytofit.recipe import defaults
@@ -81,7 +81,7 @@ def test_defaults_are_read_as_python_reads_them(module, name, function):
 
 
 def test_names_are_read_as_python_reads_them():
-    assert entries_of("distances", "DISTANCES").keys() == DISTANCES.keys()
+    assert entries_of("paper.distances", "DISTANCES").keys() == DISTANCES.keys()
     assert entries_of("parsing", "AXES").keys() == AXES.keys()
     assert entries_of("reconstruct.cameras", "PRESETS").keys() == CAMERAS.keys()
     assert entries_of("fitting", "METHODS") == {name: function.__name__ for name, function in METHODS.items()}

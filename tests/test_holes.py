@@ -5,9 +5,9 @@ import pytest
 from scipy.stats import ttest_1samp
 
 import phytofit
-from phytofit.hidden import Hidden, cells
-from phytofit.holes import find_holes
-from phytofit.likelihood import CloudLikelihood
+from phytofit.engine.holes import find_holes
+from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.visibility import Hidden, cells
 from phytofit.models import LEAF, Organ
 from phytofit.models.organs import frames_along
 
@@ -148,5 +148,5 @@ def test_intervals_know_that_a_hole_may_end_elsewhere(monkeypatch):
         return width.high - width.low
 
     known = spread()
-    monkeypatch.setattr("phytofit.covariance._by_holes", lambda *of: np.zeros_like(of[-1]))
+    monkeypatch.setattr("phytofit.engine.covariance._by_holes", lambda *of: np.zeros_like(of[-1]))
     assert known > 1.05 * spread()

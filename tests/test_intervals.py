@@ -6,9 +6,9 @@ from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
 import phytofit
-from phytofit.dependence import NONE, width_misfit
-from phytofit.intervals import covariance_of_independent, propagated
-from phytofit.likelihood import CloudLikelihood
+from phytofit.engine.dependence import NONE, width_misfit
+from phytofit.engine.intervals import covariance_of_independent, propagated
+from phytofit.engine.likelihood import CloudLikelihood
 
 ROUNDING = 1e-9
 DRAWN = 0.05  # relative; quantiles of a hundred thousand draws, and what is lost by looking along axes only

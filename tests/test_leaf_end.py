@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import phytofit
-from phytofit import leaf_end
-from phytofit.fitted import remarked
-from phytofit.hidden import N_STRIPS, Hidden
-from phytofit.leaf_end import MISFIT, PointsEnd, combined, ending, points_end
-from phytofit.likelihood import CloudLikelihood
+from phytofit.engine import leaf_end
+from phytofit.engine.leaf_end import MISFIT, PointsEnd, combined, ending, points_end
+from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.visibility import N_STRIPS, Hidden
 from phytofit.models import Organ, move
 from phytofit.models.organs import frames_along
+from phytofit.results.fit import remarked
 from phytofit.traits import measure
 
 SPECIES = phytofit.load_species()

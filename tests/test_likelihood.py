@@ -11,14 +11,14 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from phytofit import likelihood as module
-from phytofit.hidden import Hidden
+from phytofit.engine import likelihood as module
+from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.visibility import Hidden
+from phytofit.engine.voids import Void
 from phytofit.kernels.likelihood import log_density
-from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import LEAF, STEM, Organ, Phytomer, SurfaceSampler, move
 from phytofit.models.organs import frames_along
 from phytofit.species import load_species
-from phytofit.voids import Void
 
 EXACT = 1e-9  # relative; sums in float64
 BESSEL = 1e-6  # relative; the tube's Bessel function is a polynomial, good to a few 1e-7

@@ -15,7 +15,7 @@ import phytofit.models
 import phytofit.parameters
 import phytofit.simulation
 from phytofit import Status
-from phytofit.fitted import beside_its_rival
+from phytofit.results.fit import beside_its_rival
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "sodhi2018"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data/sodhi2018 is absent")

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 import phytofit
 import phytofit.simulation
-from phytofit.fitted import MUCH_ELSEWHERE, remarked
-from phytofit.flags import UNUSABLE
-from phytofit.unexplained import on_something_else
+from phytofit.engine.unexplained import on_something_else
+from phytofit.results.fit import MUCH_ELSEWHERE, remarked
+from phytofit.results.remarks import UNUSABLE
 
 SEEDS = st.integers(0, 2**32 - 1)
 FIXED = {"leaf_length": 50.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 15.0}

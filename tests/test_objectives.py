@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from phytofit import CloudError, load_species, objectives
-from phytofit.distances import DISTANCES, Reference, chamfer, labelled_hausdorff, quantile_hausdorff
+from phytofit import CloudError, load_species
 from phytofit.models import SurfaceSampler
-from phytofit.objectives import PaperObjective
+from phytofit.paper import objective as objectives
+from phytofit.paper.distances import DISTANCES, Reference, chamfer, labelled_hausdorff, quantile_hausdorff
+from phytofit.paper.objective import PaperObjective
 
 FLOAT32_CM = 2e-4  # clouds are float32 about 60 cm from the origin in the kernels
 N_POINTS = 600

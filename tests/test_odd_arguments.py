@@ -139,9 +139,7 @@ def nothing_is_measured(monkeypatch):
         raise typer.Exit(0)
 
     monkeypatch.setattr("phytofit.fitting.fit", stop)
-    monkeypatch.setattr(
-        "phytofit.results.save_simulated", lambda made, *_, **__: next(iter(made)) and [Path("missing.ply")]
-    )
+    monkeypatch.setattr("phytofit.io.save_simulated", lambda made, *_, **__: next(iter(made)) and [Path("missing.ply")])
 
 
 def complaint(command, arguments):

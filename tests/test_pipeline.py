@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 from phytofit import NoPhytomerError, fit, from_points, read_cloud, write_cloud
 from phytofit.cli import app
 from phytofit.errors import InputError, OutputError, SettingError
+from phytofit.io import COLUMNS, read_segmentation
 from phytofit.pipeline import plant_traits, run
 from phytofit.pipeline.stages import done, is_edited, key_of, up_to_date
-from phytofit.results import COLUMNS, read_segmentation
 from phytofit.segmentation import segment
 from phytofit.version import state_of_the_code
 from test_segmentation import leaf_axis, plant

@@ -16,13 +16,13 @@ from matplotlib.colors import to_rgb
 
 import phytofit
 import phytofit.plots
+from phytofit.io import trait_table
 from phytofit.plots import plot_plant, plot_plants
 from phytofit.plots.page import digits, fitting, folded, in_short, interval, number, width_in
 from phytofit.plots.phytomer import MEASURE
 from phytofit.plots.plant import LEAF_COLORS
 from phytofit.plots.views import widest_side
 from phytofit.reconstruct.placing import Rejected
-from phytofit.results import trait_table
 from phytofit.segmentation import SegmentedLeaf
 from phytofit.traits import Trait
 

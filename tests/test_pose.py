@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from phytofit.errors import NoPhytomerError
-from phytofit.pose import StartPose, start_poses, with_tube
 from phytofit.simulation import simulate
+from phytofit.start.pose import StartPose, start_poses, with_tube
 
 STEM_RADIUS = 2.7  # cm; the largest that a sorghum prior expects
 AXIS_DEG = 10.0  # ICP turns the model by as much

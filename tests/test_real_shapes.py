@@ -8,11 +8,11 @@ import pytest
 import phytofit
 import phytofit.models
 import phytofit.simulation
-from phytofit import posterior
-from phytofit.beginnings import along_points, longer_leaf, longer_stem, lower_insertion, turned_blade
-from phytofit.dependence import Bell, Dependence
+from phytofit.engine import search as posterior
+from phytofit.engine.dependence import Bell, Dependence
+from phytofit.engine.refine import Cloud, refined_end
+from phytofit.engine.restarts import along_points, longer_leaf, longer_stem, lower_insertion, turned_blade
 from phytofit.models.organs import frames_along
-from phytofit.refining import Cloud, refined_end
 
 GENTLE = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 15.0}
 REAL = {"leaf_base_width": 0.5, "leaf_widest_at": 0.4, "leaf_bow": 10.0}
@@ -52,7 +52,9 @@ def test_the_start_with_a_turned_blade_is_turned_as_the_points_lie():
     made = grown(leaf_roll=60.0, leaf_twist=30.0)
     plain = SPECIES.leading(7)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
-    start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(made.x[:7], np.eye(4), 1.0)
+    start = phytofit.engine.likelihood.CloudLikelihood(plain.model, plain.space, points).start(
+        made.x[:7], np.eye(4), 1.0
+    )
     end = refined_end(plain, start, Cloud(points, None, None))
     (turned,) = turned_blade(SPECIES, end.likelihood, end.state, end.at.scores)
     assert turned.x[NAMES.index("leaf_roll")] == pytest.approx(60.0, abs=15.0)
@@ -63,7 +65,7 @@ def test_the_start_with_a_turned_blade_is_turned_as_the_points_lie():
 def test_a_blade_on_edge_is_begun_turned_back(roll):
     """A rich leaf that has taken the blade's width for its thickness: where it ends is a hill of its own."""
     made = grown(leaf_roll=roll, leaf_twist=20.0, leaf_bow=25.0, leaf_side_bend=20.0)
-    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points, thick=True)
+    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points, thick=True)
     x = made.x.copy()
     x[NAMES.index("leaf_roll")] += 90.0
     x[NAMES.index("leaf_width")] = 2.0
@@ -79,7 +81,9 @@ def test_a_level_blade_is_not_begun_turned():
     made = grown()
     plain = SPECIES.leading(7)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
-    start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(made.x[:7], np.eye(4), 1.0)
+    start = phytofit.engine.likelihood.CloudLikelihood(plain.model, plain.space, points).start(
+        made.x[:7], np.eye(4), 1.0
+    )
     end = refined_end(plain, start, Cloud(points, None, None))
     assert list(turned_blade(SPECIES, end.likelihood, end.state, end.at.scores)) == []
 
@@ -96,7 +100,7 @@ def test_a_sheath_that_ends_at_the_collar():
 
 def test_the_start_with_a_lower_insertion_moves_only_the_leafs_base():
     made = grown()
-    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
+    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
     (lower,) = lower_insertion(SPECIES, likelihood.start(made.x, np.eye(4), 0.3))
     assert lower.x[1] == pytest.approx(made.x[1] - 0.12 * made.x[3])
     assert lower.x[1] + lower.x[6] == pytest.approx(made.x[1] + made.x[6])
@@ -182,7 +186,7 @@ def test_a_leaf_that_curls_back_is_begun_along_its_points():
     """From a state whose leaf stops where the real one turns away, the midrib is laid along the rest of it."""
     made = grown(leaf_length=70.0, leaf_rotate_angle=5.5, leaf_bow=0.0, n_points=4000)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
-    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, points)
     x = made.x.copy()
     x[[3, 5]] = 45.0, 1.0
     state = likelihood.start(x, np.eye(4), 0.5)
@@ -199,7 +203,7 @@ def test_a_leaf_in_pieces_has_no_line():
     made = grown(leaf_length=70.0)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
     scarce = np.concatenate([points[made.labels == 1], points[made.labels == 2][:15]])
-    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, scarce)
+    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, scarce)
     state = likelihood.start(made.x, np.eye(4), 0.5)
     assert list(along_points(SPECIES, likelihood, state, likelihood.evaluate(state).scores)) == []
 
@@ -306,7 +310,7 @@ def test_a_leaf_of_many_points_is_not_called_sparse():
 
 def test_a_longer_leaf_is_begun_only_where_points_are_left_over():
     made = grown(**OWN)
-    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
+    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
     state = likelihood.start(made.x, made.pose, 0.3)
     longer = list(longer_leaf(state))
     assert [it.x[3] / state.x[3] for it in longer] == pytest.approx([1.12, 1.3])
@@ -358,7 +362,7 @@ def test_a_longer_stem_is_begun_beyond_a_gap(lost):
     height = ((made.points - made.pose[:3, 3]) @ made.pose[:3, :3])[:, 2]
     gap = (height > 18.0) & (height < 22.0) if lost == "above" else (height > 5.0) & (height < 9.0)
     points = made.points[~gap | (made.labels == 2)]
-    likelihood = phytofit.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, points)
     x = made.x.copy()
     if lost == "above":
         x[6] = 3.0
@@ -405,7 +409,7 @@ def wavy_ends():
     points, _ = wavy()
     plain = SPECIES.leading(7)
     upright = np.array([1.2, 15.0, 30.0, 60.0, 5.0, 3.0, 10.0])
-    start = phytofit.likelihood.CloudLikelihood(plain.model, plain.space, points).start(upright, np.eye(4), 2.0)
+    start = phytofit.engine.likelihood.CloudLikelihood(plain.model, plain.space, points).start(upright, np.eye(4), 2.0)
     return points, posterior._candidates(plain, SPECIES, Cloud(points, None, None), start)
 
 

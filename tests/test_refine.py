@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import optimize
 
-from phytofit.optimize import refine
+from phytofit.engine.scoring import refine
 
 TOLERANCE = 1e-3  # nats; what an error may lie above its minimum when a step is expected to gain no more
 NEAR = 0.03  # standard errors of a parameter; 0.5 x 0.03² is less than half of TOLERANCE

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 
 from phytofit import from_points, load_species, simulate
 from phytofit.errors import OutputError, SettingError
-from phytofit.models import mesh
-from phytofit.results import (
+from phytofit.io import (
     FolderTable,
     read_table,
     replacing,
@@ -30,6 +29,7 @@ from phytofit.results import (
     write_table,
     write_workbook,
 )
+from phytofit.models import mesh
 from phytofit.traits import Trait
 
 FORMULA = "=1+1|' /C calc'!A0"

@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 
 import phytofit
 from phytofit.cli import app
-from phytofit.meant import meant_points
-from phytofit.pose import start_poses
+from phytofit.start.pose import start_poses
+from phytofit.start.target_leaf import target_leaf_points
 
 FIXED = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 15.0}
 LENGTH_CM = 1.5
@@ -101,7 +101,7 @@ def with_another(made, turn, lower):
 def test_a_leaf_that_touches_or_is_beside_it_at_the_stem_is_flagged(turn, lower, touches, n_points):
     made = phytofit.simulate(fixed=FIXED, n_points=n_points, noise_cm=0.3, seed=4)
     points, _ = with_another(made, turn, lower)
-    told = meant_points(points, made.organs[1].axis[[15]], partial(start_poses, stem_radius=2.7))
+    told = target_leaf_points(points, made.organs[1].axis[[15]], partial(start_poses, stem_radius=2.7))
     assert told.others_touch == touches
 
 
@@ -112,7 +112,7 @@ def test_what_touches_comes_with_the_result(seeded):
 def test_of_a_leaf_that_is_fused_with_the_one_that_is_meant_most_is_left_out(crowded):
     made, _, on_leaf = crowded
     points, foreign = with_another(made, 15.0, 2.0)
-    told = meant_points(points, on_leaf[np.newaxis], partial(start_poses, stem_radius=2.7))
+    told = target_leaf_points(points, on_leaf[np.newaxis], partial(start_poses, stem_radius=2.7))
     upright = (points - made.pose[:3, 3]) @ made.pose[:3, :3]
     beside = np.hypot(upright[:, 0], upright[:, 1]) > 4.0
     assert np.mean(told.points[foreign & beside]) < 0.33
@@ -128,7 +128,7 @@ def test_a_wide_stem_among_leaves_keeps_its_ends(seed):
     )
     others = [with_another(made, turn, random.uniform(-8.0, 10.0)) for turn in (100.0, 220.0)]
     points = np.concatenate([made.points, *(every[foreign] for every, foreign in others)])
-    told = meant_points(points, made.organs[1].axis[[12]], partial(start_poses, stem_radius=2.7))
+    told = target_leaf_points(points, made.organs[1].axis[[12]], partial(start_poses, stem_radius=2.7))
     assert np.mean(told.points[: len(made.points)][made.labels == 1]) > 0.97
 
 

@@ -8,9 +8,9 @@ import pytest
 import phytofit
 from phytofit.display import Shown, Summary
 from phytofit.errors import SettingError, UnitError
+from phytofit.io import COLUMNS, trait_table
 from phytofit.pipeline import PlantRun
 from phytofit.reconstruct import CAMERAS, Reconstruction
-from phytofit.results import COLUMNS, trait_table
 from phytofit.segmentation import Segmentation, SegmentedLeaf
 
 HOSTILE = "<b>[red]x[/]\x1b[31m\n=cmd"

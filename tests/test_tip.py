@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import phytofit
-from phytofit.flags import sighting
-from phytofit.likelihood import CloudLikelihood
-from phytofit.tip import gain_of_blunt_end
+from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.sighting import sighting
+from phytofit.engine.tip import gain_of_blunt_end
 
 SPECIES = phytofit.load_species()
 TAPERS_EVENLY = {"leaf_taper": 0.3, "leaf_length": 50.0, "leaf_width": 6.0, "leaf_angle": 50.0}

@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import phytofit
-from phytofit.hidden import Hidden
-from phytofit.holes import find_holes
-from phytofit.likelihood import CloudLikelihood
+from phytofit.engine.holes import find_holes
+from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.visibility import Hidden
+from phytofit.engine.voids import Void, around_stem
 from phytofit.models import Phytomer
-from phytofit.voids import Void, around_stem
 
 SPECIES = phytofit.load_species().leading(7)
 NOISE_CM = 0.4

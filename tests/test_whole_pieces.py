@@ -7,13 +7,13 @@ from scipy.special import ndtr
 from scipy.stats import ttest_1samp
 
 import phytofit
-from phytofit import outcome
-from phytofit.covariance import grown
-from phytofit.hidden import N_STRIPS, Hidden
-from phytofit.likelihood import CloudLikelihood
+from phytofit.engine import outcome
+from phytofit.engine.covariance import grown
+from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.refine import refinement
+from phytofit.engine.visibility import N_STRIPS, Hidden
+from phytofit.engine.whole_pieces import WIDTHS, of_whole_pieces
 from phytofit.models import move
-from phytofit.refining import refinement
-from phytofit.whole_pieces import WIDTHS, of_whole_pieces
 
 SPECIES = phytofit.load_species().leading(7)
 LENGTH, WIDTH = 56.0, 6.4  # cm

@@ -24,12 +24,12 @@ if TYPE_CHECKING:
         Status,
         UnitError,
     )
-    from phytofit.fitted import Fit
     from phytofit.fitting import fit
+    from phytofit.io import save_fit, save_reconstruction, save_segmentation
     from phytofit.pipeline import PlantRun, run
     from phytofit.recipe import recipe
     from phytofit.reconstruct import CAMERAS, Camera, Reconstruction, load_camera, reconstruct
-    from phytofit.results import save_fit, save_reconstruction, save_segmentation
+    from phytofit.results.fit import Fit
     from phytofit.segmentation import Segmentation, SegmentedLeaf, segment, separate_plants
     from phytofit.simulation import SimulatedPhytomer, simulate
     from phytofit.species import Species, load_species
@@ -101,7 +101,7 @@ MODULES = {  # that are imported when the first of their names is asked for, so 
         "Status",
         "UnitError",
     ),
-    "phytofit.fitted": ("Fit",),
+    "phytofit.results.fit": ("Fit",),
     "phytofit.fitting": ("fit",),
     "phytofit.pipeline": (
         "PlantRun",
@@ -115,7 +115,7 @@ MODULES = {  # that are imported when the first of their names is asked for, so 
         "load_camera",
         "reconstruct",
     ),
-    "phytofit.results": (
+    "phytofit.io": (
         "save_fit",
         "save_reconstruction",
         "save_segmentation",

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from phytofit.errors import OutputError, PhytofitError, SettingError
-from phytofit.results import LOG, FolderTable, open_log, prepare_folder, result_names, write_failures, write_workbook
+from phytofit.io import LOG, FolderTable, open_log, prepare_folder, result_names, write_failures, write_workbook
 from phytofit.text import one_line
 
 __all__ = ["Outcome", "each_cloud"]

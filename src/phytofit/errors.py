@@ -20,6 +20,7 @@ to do.
 from enum import Enum
 
 __all__ = [
+    "ONE_LEAF_ONLY",
     "CloudError",
     "InputError",
     "NoPhytomerError",
@@ -31,6 +32,9 @@ __all__ = [
     "Status",
     "UnitError",
 ]
+
+
+ONE_LEAF_ONLY = "measure a whole plant with phytofit.run, or give a seed point on the leaf you want"
 
 
 class Status(Enum):

@@ -13,18 +13,16 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
 from phytofit.cloud import PointCloud, as_cloud
-from phytofit.distances import DISTANCES, Reference
-from phytofit.errors import NoPhytomerError, SettingError, Status
-from phytofit.fitted import Fit, beside_its_rival, remarked
-from phytofit.flags import ONE_LEAF_ONLY
-from phytofit.objectives import PaperObjective, minimise
-from phytofit.optimize import CrossEntropy, Generation
+from phytofit.engine.search import estimate
+from phytofit.errors import ONE_LEAF_ONLY, NoPhytomerError, SettingError, Status
+from phytofit.paper import DISTANCES, CrossEntropy, Generation, PaperObjective, Reference, minimise
+from phytofit.paper.scouting import scout
 from phytofit.parsing import checked_flag, checked_number, checked_whole, parse_points, parse_up
-from phytofit.pose import StartPose, parts_of_stem
-from phytofit.posterior import DITHER_CM, estimate
-from phytofit.preparation import Prepared, prepare
+from phytofit.results.fit import Fit, beside_its_rival, remarked
 from phytofit.segmentation.plants import separate_plants
 from phytofit.species import Species, load_species
+from phytofit.start.pose import StartPose, parts_of_stem
+from phytofit.start.prepare import DITHER_CM, Prepared, dithered, prepare
 
 __all__ = ["METHODS", "fit", "mean_at"]
 
@@ -74,7 +72,7 @@ def fit(
     n_samples, n_generations : of the cross-entropy search: 500 candidates in each of 10 generations for "paper",
         60 in each of 4 for "likelihood", which is refined afterwards
     n_points : to which the cloud is thinned: 10,000 for "likelihood"; 5,000 for "paper", and also of each candidate
-    elite_fraction, covariance_noise : see :class:`phytofit.optimize.CrossEntropy`
+    elite_fraction, covariance_noise : see :class:`phytofit.paper.CrossEntropy`
     random_start : start the search from means drawn from the prior (as in Fig. 7d), not from the prior's and, for
         the stem's diameter and lengths, from the start pose
     stem_above : of the stem above the leaf: "equal", as long as below it; "none"; or "free", a parameter of its own.
@@ -243,11 +241,12 @@ def fit_likelihood(
     """The most probable phytomer of a cloud, thinned to `n_points`: a short cross-entropy search, then refinement."""
     species = species.with_stem_above(stem_above)
     means = _means(found, species.leading(N_SEARCHED), random_start, seed)
-    most_probable = estimate(
-        species,
-        found.points,
-        [(mean, _foot_pose(start)) for mean, start in zip(means, found.starts, strict=True)],
-        organ=found.organ,
+    points = dithered(found.points, seed)
+    starts = [(mean, _foot_pose(start)) for mean, start in zip(means, found.starts, strict=True)]
+    near, history = scout(
+        species.leading(N_SEARCHED),
+        points,
+        starts,
         n_samples=n_samples,
         n_generations=n_generations,
         elite_fraction=elite_fraction,
@@ -256,6 +255,7 @@ def fit_likelihood(
         executor=executor,
         progress=progress,
     )
+    most_probable = estimate(species, points, [near, *starts], organ=found.organ, executor=executor)
     return Fit(
         species=species.leading(len(most_probable.x)),
         x=most_probable.x,
@@ -263,13 +263,13 @@ def fit_likelihood(
         trait_covariance=most_probable.trait_covariance,
         pose=most_probable.pose,
         error=most_probable.error,
-        history=most_probable.history,
+        history=history,
         status=Status.AT_REST if most_probable.converged else Status.MOVING,
         seed=seed,
         reference=found.points,
         method="likelihood",
         estimate=most_probable,
-        notes=(DITHERED,) if most_probable.dithered else (),
+        notes=(DITHERED,) if points is not found.points else (),
     )
 
 

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from typing import Any
 
 from phytofit.cloud import remove_outliers, thin
-from phytofit.distances import chamfer, hausdorff, labelled_hausdorff, quantile_hausdorff
-from phytofit.fitted import Fit
 from phytofit.fitting import METHODS, fit, fit_likelihood, fit_paper
-from phytofit.objectives import PaperObjective
-from phytofit.posterior import SCOUTING, estimate
+from phytofit.paper.distances import chamfer, hausdorff, labelled_hausdorff, quantile_hausdorff
+from phytofit.paper.objective import PaperObjective
+from phytofit.paper.scouting import SCOUTING, scout
 from phytofit.reconstruct import reconstruct
+from phytofit.results.fit import Fit
 from phytofit.segmentation import segment
 
 __all__ = ["defaults", "recipe", "recipe_of"]
@@ -54,7 +54,7 @@ def recipe() -> dict[str, dict[str, Any]]:
     for step, function in STEPS.items():
         handed_on = HANDED_ON.get(function, BY_METHOD)
         found[step] = {k: v for k, v in defaults(function).items() if k not in NOT_SETTINGS | handed_on}
-    found["search"] = {**found["objective"], **SCOUTING, "n_points": defaults(estimate)["n_points"]}
+    found["search"] = {**found["objective"], **SCOUTING, "n_points": defaults(scout)["n_points"]}
     return {step: settings for step, settings in found.items() if settings}
 
 

@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from phytofit import cli, fit, from_points, load_species, simulate, write_cloud
+from phytofit.io import COLUMNS
 from phytofit.reconstruct import Reconstruction, load_camera
-from phytofit.results import COLUMNS
 from phytofit.segmentation import Segmentation, SegmentedLeaf
 
-PLOTS = ("results.phytomer.plot_fit", "results.phytomer.plot_convergence", "results.plant.plot_segmentation",
-         "results.plant.plot_reconstruction", "pipeline.plant.plot_plant", "report.plot_agreement")  # fmt: skip
+PLOTS = ("io.phytomer.plot_fit", "io.phytomer.plot_convergence", "io.plant.plot_segmentation",
+         "io.plant.plot_reconstruction", "pipeline.plant.plot_plant", "report.page.plot_agreement")  # fmt: skip
 
 
 class World:

@@ -7,7 +7,7 @@ import pytest
 from commands import COMMANDS, World, fresh, run, with_notes
 from injection import DELETIONS, MAKING, Killed, files_in, injected, is_hidden
 
-from phytofit.results import replacing
+from phytofit.io import replacing
 
 SAMPLE = 15  # in the daily tests every so many-th write fails
 

@@ -199,8 +199,8 @@ def results_in(folder: Path) -> Iterator[None]:
     """The folder of results is made ready; meanwhile all that is said is logged there."""
     from importlib.metadata import version
 
-    from phytofit.results import prepare_folder
-    from phytofit.results.log import open_log
+    from phytofit.io import prepare_folder
+    from phytofit.io.log import open_log
 
     with open_log(prepare_folder(folder)), _ending():
         LOG.info("phytofit %s, Python %s, %s", version("phytofit"), platform.python_version(), platform.platform())

@@ -24,7 +24,7 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
         phytofit demo --out demo
     """
     from phytofit.cloud import read_cloud
-    from phytofit.results import save_fit, save_simulated
+    from phytofit.io import save_fit, save_simulated
     from phytofit.simulation import simulate
     from phytofit.species import load_species
     from phytofit.traits import measure

@@ -12,7 +12,7 @@ from phytofit.cli.progress import Items, Told
 from phytofit.errors import PhytofitError
 
 if TYPE_CHECKING:
-    from phytofit.results import FolderTable
+    from phytofit.io import FolderTable
 
 __all__ = ["measure_each"]
 

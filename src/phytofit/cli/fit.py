@@ -32,14 +32,14 @@ from phytofit.text import for_terminal
 
 if TYPE_CHECKING:
     from phytofit.cloud import PointCloud
-    from phytofit.fitted import Fit
-    from phytofit.optimize import Generation
+    from phytofit.paper.cross_entropy import Generation
+    from phytofit.results.fit import Fit
 
 __all__ = ["fit_command", "fit_in_view"]
 
 FIT = defaults_of("fitting", "fit")
 STEM_ABOVE = [*entries_of("species", "STEM_ABOVE")]
-DISTANCES = [*entries_of("distances", "DISTANCES")]
+DISTANCES = [*entries_of("paper.distances", "DISTANCES")]
 SEARCH_SHARE = 0.3  # of the time of a fit by the default method; the rest refines what was found
 METHODS = {name: defaults_of("fitting", function) for name, function in entries_of("fitting", "METHODS").items()}
 
@@ -148,7 +148,7 @@ def fit_command(
 
         phytofit fit crowded.ply --units cm --seed-point 12.5,-3,40
     """
-    from phytofit.results import fit_tables, save_fit
+    from phytofit.io import fit_tables, save_fit
     from phytofit.species import load_species
 
     if method != "paper":

@@ -100,7 +100,7 @@ CAMERAS = [*entries_of("reconstruct.cameras", "PRESETS")]
 UNITS = [*entries_of("cloud.units", "SCALE_CM")]
 DEPTH_UNITS = [unit for unit in UNITS if unit != "none"]
 SPECIES = species_names()
-MESHES = value_of("results.models", "MESHES")
+MESHES = value_of("io.models", "MESHES")
 STEMS_ABOVE = "The stem above the leaf: equal (as long as below it), none (not there) or free (of a length of its own)"
 
 Seed = Annotated[int, numeric("The same seed gives the same result.", least=0, most=MOST_SEED)]

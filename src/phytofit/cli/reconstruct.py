@@ -58,8 +58,8 @@ def reconstruct_command(
 
         phytofit reconstruct scan --camera realsense-d4xx --poses poses.json
     """
+    from phytofit.io import check_reconstruction, save_reconstruction
     from phytofit.reconstruct import reconstruct
-    from phytofit.results import check_reconstruction, save_reconstruction
 
     check_images(images)
     if images.resolve() == folder.resolve():

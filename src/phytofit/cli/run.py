@@ -146,8 +146,8 @@ def _run_all(plants: list[Path], settings: dict[str, Any], folder: Path, *, work
     """Measure one plant after the other; what goes wrong with one does not keep the others from being measured."""
     import pandas as pd
 
+    from phytofit.io import read_table, result_names, write_table, write_workbook
     from phytofit.pipeline import run
-    from phytofit.results import read_table, result_names, write_table, write_workbook
 
     alone = len(plants) == 1
     items = Items(len(plants), "plant", in_stages=True)

@@ -50,7 +50,7 @@ def segment_command(
 
         phytofit segment corrected.ply --units mm --labels label
     """
-    from phytofit.results import leaf_tables, save_plants
+    from phytofit.io import leaf_tables, save_plants
     from phytofit.segmentation import PLANT_CM, segment, separate_plants
 
     files, skipped = cloud_files(clouds)

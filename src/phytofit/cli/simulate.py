@@ -81,7 +81,7 @@ def simulate_command(
 
         phytofit simulate --number 10 --noise 0.5 --spheres 1 --set leaf_length=60 --out simulated
     """
-    from phytofit.results import save_simulated
+    from phytofit.io import save_simulated
     from phytofit.simulation import simulate
     from phytofit.species import load_species
 

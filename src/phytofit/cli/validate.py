@@ -238,7 +238,7 @@ def _write(
 ) -> None:
     import pandas as pd
 
-    from phytofit.results import save_validation
+    from phytofit.report import save_validation
 
     statistics = pd.DataFrame(found).assign(outliers=["; ".join(a.outliers) for a in found])
     save_validation(folder, {"pairs": pairs, "validation": statistics, **others}, page)

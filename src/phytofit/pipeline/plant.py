@@ -14,12 +14,7 @@ from phytofit.cloud import PointCloud, read_cloud
 from phytofit.display import Shown, Summary
 from phytofit.errors import CloudError, InputError, NoPhytomerError, NoStemError, OutputError, PhytofitError
 from phytofit.fitting import fit
-from phytofit.pipeline.stages import KEY, done, is_edited, key_of, up_to_date
-from phytofit.pipeline.traits import by_its_points, of_leaf, plant_traits
-from phytofit.plots import plot_plant, plot_plants
-from phytofit.recipe import recipe
-from phytofit.reconstruct import depth_files, reconstruct
-from phytofit.results import (
+from phytofit.io import (
     COLUMNS,
     LOG,
     OURS,
@@ -40,6 +35,11 @@ from phytofit.results import (
     whole_folder,
     write_table,
 )
+from phytofit.pipeline.stages import KEY, done, is_edited, key_of, up_to_date
+from phytofit.pipeline.traits import by_its_points, of_leaf, plant_traits
+from phytofit.plots import plot_plant, plot_plants
+from phytofit.recipe import recipe
+from phytofit.reconstruct import depth_files, reconstruct
 from phytofit.segmentation import PLANT_CM, Segmentation, SegmentedLeaf, numbering, segment, separate_plants
 from phytofit.small_files import read_json
 from phytofit.species import Species, load_species

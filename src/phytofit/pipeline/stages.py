@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from phytofit.errors import InputError
-from phytofit.results import file_hash, write_text
+from phytofit.io import file_hash, write_text
 from phytofit.small_files import read_json
 from phytofit.version import state_of_the_code
 

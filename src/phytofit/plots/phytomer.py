@@ -8,7 +8,6 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from phytofit.fitted import Fit
 from phytofit.models import Organ, mesh
 from phytofit.plots.page import (
     CELL_IN,
@@ -31,6 +30,7 @@ from phytofit.plots.page import (
     number,
 )
 from phytofit.plots.views import Panel, View, arranged, widest_side
+from phytofit.results.fit import Fit
 from phytofit.traits import CHORD_CM, Trait, leaves_stem_at
 
 __all__ = ["plot_convergence", "plot_fit"]

@@ -77,7 +77,7 @@ class Segmentation(Shown):
 
     def to_frame(self) -> "pd.DataFrame":
         """The leaves as a table, with the columns of ``leaves.csv``."""
-        from phytofit.results import leaf_table
+        from phytofit.io import leaf_table
 
         return leaf_table(self.cloud.name, self)
 

@@ -7,14 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from phytofit.covariance import covariance_of, grown, misfit_of, mixed, of_sensor, shared_by_neighbors
-from phytofit.dependence import Dependence, score_dependence, width_misfit
-from phytofit.flags import Sighting, sighting
-from phytofit.leaf_end import Ending, ending
-from phytofit.optimize import Generation
-from phytofit.refining import End, evidence_of, refinement
-from phytofit.tip import gain_of_blunt_end
-from phytofit.whole_pieces import of_whole_pieces
+from phytofit.engine.covariance import covariance_of, grown, misfit_of, mixed, of_sensor, shared_by_neighbors
+from phytofit.engine.dependence import Dependence, score_dependence, width_misfit
+from phytofit.engine.leaf_end import Ending, ending
+from phytofit.engine.refine import End, evidence_of, refinement
+from phytofit.engine.sighting import Sighting, sighting
+from phytofit.engine.tip import gain_of_blunt_end
+from phytofit.engine.whole_pieces import of_whole_pieces
 
 __all__ = ["Chosen", "Elsewhere", "Estimate", "outcome"]
 
@@ -60,7 +59,7 @@ class Estimate:
     not; ``width_misfit``: by what share its width is off the model's, place by place; ``correlated_cm``: how far errors
     of neighbours on the leaf are correlated, 0 if they are not; ``rival`` (m,): parameters of the other model, if it is
     about as probable; ``quantile``: standard errors to either side of a 95 % interval, Student's; ``sighting``: what of
-    the phytomer the cloud shows; ``dithered``: whether noise was added to the points, which had none.
+    the phytomer the cloud shows.
     """
 
     x: FloatArray
@@ -84,12 +83,10 @@ class Estimate:
     rival: FloatArray | None
     quantile: float
     converged: bool
-    history: tuple[Generation, ...]
     sighting: Sighting
-    dithered: bool
 
 
-def outcome(chosen: Chosen, history: tuple[Generation, ...], *, dithered: bool) -> Estimate:
+def outcome(chosen: Chosen) -> Estimate:
     end, dependence = chosen.end, chosen.dependence
     likelihood, state, at = end.likelihood, end.state, end.at
     k = state.n_parameters
@@ -127,9 +124,7 @@ def outcome(chosen: Chosen, history: tuple[Generation, ...], *, dithered: bool) 
         rival=chosen.rival,
         quantile=float(stdtrit(left, 0.975)),
         converged=converged,
-        history=history,
         sighting=seen,
-        dithered=dithered,
     )
 
 

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from phytofit.report import GENERATOR
-from phytofit.results.replacing import check_made, prepare_folder, whole_files
-from phytofit.results.tables import check_table, write_table
+from phytofit.io import check_made, check_table, prepare_folder, whole_files, write_table
+from phytofit.report.page import GENERATOR
 
 __all__ = ["save_validation"]
 

@@ -10,9 +10,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
-from phytofit.flags import across_leaf
+from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.sighting import across_leaf
 from phytofit.kernels.neighbors import sum_by_distance
-from phytofit.likelihood import CloudLikelihood, State
 from phytofit.models import Organ, move
 
 __all__ = ["Dependence", "score_dependence", "width_misfit"]

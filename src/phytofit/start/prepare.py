@@ -5,18 +5,20 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from phytofit.cloud import PointCloud, remove_outliers, size_cm, thin
-from phytofit.errors import NoPhytomerError
-from phytofit.flags import ONE_LEAF_ONLY
-from phytofit.meant import meant_points
+from phytofit.errors import ONE_LEAF_ONLY, NoPhytomerError
 from phytofit.ordering import canonical_order
-from phytofit.pose import StartPose, start_poses
 from phytofit.species import Species
+from phytofit.start.pose import StartPose, start_poses
+from phytofit.start.target_leaf import target_leaf_points
 
-__all__ = ["Prepared", "prepare"]
+__all__ = ["DITHER_CM", "Prepared", "dithered", "prepare"]
 
 FloatArray = NDArray[np.float64]
+DITHER_CM = 0.1  # added to points without noise
+N_PROBED = 300  # points around which it is seen whether there is any noise
 N_LOOKED_AT = 100_000  # points, if they are all kept for the fit, in which the stem is looked for
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
 STUB = 0.1  # of the points of the largest labelled leaf, up to which another is but a stub
@@ -63,7 +65,7 @@ def prepare(
     Points are put in one order before anything is drawn from them, and the coordinates are rounded, so that neither the
     order of the rows nor a rotation of the cloud changes the numbers.
 
-    seed_points : (k, 3) cm, on the leaf that is meant: beside the stem no other leaf's points count
+    seed_points : (k, 3) cm, on the target leaf: beside the stem no other leaf's points count
     """
     cloud = cloud.take(canonical_order(cloud.points, cloud.labels))
     looked_at = cloud.take(_some(len(cloud), N_LOOKED_AT)) if with_outliers else cloud
@@ -72,10 +74,10 @@ def prepare(
     scale = size_cm(clean.points) / _expected_size(species) if cloud.unit == "none" else 1.0
     find_starts = partial(start_poses, stem_radius=_largest_stem_radius(species), up=up)
     if seed_points is not None:
-        told, others_touch = meant_points(cloud.points / scale, seed_points / scale, find_starts)
-        meant = cloud.take(np.flatnonzero(told))
-        found = prepare(meant, species, n_points=n_points, up=up, with_outliers=with_outliers)
-        left_out = f"{len(cloud) - len(meant)} of {len(cloud)} points left out: not on the seed point's leaf"
+        on_target, others_touch = target_leaf_points(cloud.points / scale, seed_points / scale, find_starts)
+        target = cloud.take(np.flatnonzero(on_target))
+        found = prepare(target, species, n_points=n_points, up=up, with_outliers=with_outliers)
+        left_out = f"{len(cloud) - len(target)} of {len(cloud)} points left out: not on the seed point's leaf"
         flags = (OTHERS_TOUCH, *found.flags) if others_touch else found.flags
         return replace(found, notes=(left_out, *found.notes), flags=flags)
     if cloud.labels is not None:
@@ -96,6 +98,20 @@ def prepare(
         scale=scale,
         notes=tuple(_what_was_left_out(len(cloud), len(used), len(kept))),
     )
+
+
+def dithered(points: FloatArray, seed: int) -> FloatArray:
+    """The points (n, 3), with a little noise if they have next to none.
+
+    Without noise the scores say nothing of how fast the likelihood falls off, and the refinement gets stuck.
+    """
+    some = points[:: max(1, len(points) // N_PROBED)]
+    near = points[cKDTree(points).query(some, k=min(12, len(points)))[1]]
+    offset = near - near.mean(axis=1, keepdims=True)
+    rough = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", offset, offset) / near.shape[1])[:, 0]
+    if np.sqrt(max(0.0, float(np.median(rough)))) >= 0.5 * DITHER_CM:
+        return points
+    return points + np.random.default_rng(seed).normal(0.0, DITHER_CM, points.shape)
 
 
 def _some(n: int, n_wanted: int) -> NDArray[np.intp]:

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from phytofit.hidden import N_STRIPS, Hidden, cells
+from phytofit.engine.visibility import N_STRIPS, Hidden, cells
+from phytofit.engine.voids import Void, around_stem, facing_share
 from phytofit.kernels.likelihood import CHANGES, log_density, segment_changes
 from phytofit.models import Organ, Phytomer
 from phytofit.parameters import ParameterSpace
-from phytofit.voids import Void, around_stem, facing_share
 
 __all__ = ["LEAF_NOISE", "NOISE", "OUTLIERS", "SHARES", "SHIFT", "THICKNESS", "CloudLikelihood", "Evaluation", "State"]
 

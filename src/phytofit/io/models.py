@@ -10,8 +10,8 @@ import trimesh
 
 from phytofit.cloud import PointCloud
 from phytofit.errors import SettingError
+from phytofit.io.replacing import whole_file
 from phytofit.models import Organ, mesh
-from phytofit.results.replacing import whole_file
 from phytofit.text import one_line
 
 __all__ = ["MESHES", "check_meshes", "write_mesh"]

@@ -13,11 +13,11 @@ import pandas as pd
 
 from phytofit.cloud import read_cloud, write_cloud
 from phytofit.errors import InputError
+from phytofit.io.files import files_made, input_of, json_text
+from phytofit.io.replacing import check_made, file_hash, made_in, whole_files, whole_folder
+from phytofit.io.tables import FolderTable, write_table
 from phytofit.plots import plot_plants, plot_reconstruction, plot_segmentation
 from phytofit.reconstruct import Reconstruction
-from phytofit.results.files import files_made, input_of, json_text
-from phytofit.results.replacing import check_made, file_hash, made_in, whole_files, whole_folder
-from phytofit.results.tables import FolderTable, write_table
 from phytofit.segmentation import Segmentation, SegmentedLeaf
 from phytofit.text import for_file_name, one_line
 

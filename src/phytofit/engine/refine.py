@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from phytofit.hidden import Hidden
-from phytofit.holes import find_holes
-from phytofit.likelihood import CloudLikelihood, Evaluation, State
-from phytofit.optimize import Refined, refine
+from phytofit.engine.holes import find_holes
+from phytofit.engine.likelihood import CloudLikelihood, Evaluation, State
+from phytofit.engine.scoring import Refined, refine
+from phytofit.engine.visibility import Hidden
 from phytofit.species import Species
 
 __all__ = [

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from phytofit.hidden import N_STRIPS, Hidden
-from phytofit.likelihood import LEAF_NOISE, SHARES, CloudLikelihood, State
+from phytofit.engine.likelihood import LEAF_NOISE, SHARES, CloudLikelihood, State
+from phytofit.engine.visibility import N_STRIPS, Hidden
 
 __all__ = ["WIDTHS", "of_whole_pieces"]
 

@@ -10,13 +10,13 @@ import pandas as pd
 
 from phytofit.cloud import PointCloud
 from phytofit.errors import NoPhytomerError, OutputError
-from phytofit.fitted import Fit
+from phytofit.io.files import files_made, input_of, json_text
+from phytofit.io.models import write_mesh
+from phytofit.io.replacing import whole_folder
+from phytofit.io.tables import FolderTable, write_table
 from phytofit.plots import plot_convergence, plot_fit
 from phytofit.recipe import recipe_of
-from phytofit.results.files import files_made, input_of, json_text
-from phytofit.results.models import write_mesh
-from phytofit.results.replacing import whole_folder
-from phytofit.results.tables import FolderTable, write_table
+from phytofit.results.fit import Fit
 from phytofit.text import for_file_name
 from phytofit.traits import Trait
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import pandas as pd
 
 from phytofit.cloud import PointCloud, write_cloud
-from phytofit.results.files import json_text
-from phytofit.results.phytomer import COLUMNS, trait_table
-from phytofit.results.replacing import check_made, file_hash, whole_files
-from phytofit.results.tables import check_table, write_table
+from phytofit.io.files import json_text
+from phytofit.io.phytomer import COLUMNS, trait_table
+from phytofit.io.replacing import check_made, file_hash, whole_files
+from phytofit.io.tables import check_table, write_table
 from phytofit.simulation import SimulatedPhytomer
 from phytofit.species import Species
 from phytofit.traits import measure

@@ -9,8 +9,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
-from phytofit.flags import across_leaf
-from phytofit.likelihood import SHIFT, CloudLikelihood, State
+from phytofit.engine.likelihood import SHIFT, CloudLikelihood, State
+from phytofit.engine.sighting import across_leaf
 from phytofit.species import Species
 
 __all__ = ["along_points", "longer_leaf", "longer_stem", "lower_insertion", "turned_blade"]

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import ndtr
 
-from phytofit.flags import across_leaf
-from phytofit.likelihood import CloudLikelihood, State
+from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.sighting import across_leaf
 
 __all__ = ["gain_of_blunt_end"]
 

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from phytofit.distances import Distance, Reference, hausdorff
 from phytofit.errors import SettingError
 from phytofit.kernels.icp import MAX_MEMORY, icp, transform
 from phytofit.models import Phytomer, SurfaceSampler
 from phytofit.models.organs import PopulationSurfaces
-from phytofit.optimize import CrossEntropy, Generation
+from phytofit.paper.cross_entropy import CrossEntropy, Generation
+from phytofit.paper.distances import Distance, Reference, hausdorff
 
 __all__ = ["PaperObjective", "Registration", "minimise"]
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
+from phytofit.engine.voids import PARTS, Void
 from phytofit.models import Organ
-from phytofit.voids import PARTS, Void
 
 __all__ = ["N_STRIPS", "Hidden", "cells"]
 

@@ -4,11 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, convolve1d
 
-from phytofit.flags import clearly_lacking, strip_of
-from phytofit.hidden import N_STRIPS, Hidden
-from phytofit.likelihood import CloudLikelihood, State
+from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.sighting import clearly_lacking, strip_of
+from phytofit.engine.visibility import N_STRIPS, Hidden
+from phytofit.engine.voids import find_void
 from phytofit.models import Organ, move
-from phytofit.voids import find_void
 
 __all__ = ["find_holes"]
 

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phytofit.display import Shown, Summary
-from phytofit.errors import NoPhytomerError, Status
-from phytofit.flags import FEW_ON_STEM, IMPLAUSIBLE, NEAR_BOUND, ONE_LEAF_ONLY, UNUSABLE, flags_of
-from phytofit.intervals import Ends, propagated
+from phytofit.engine.intervals import Ends, propagated
+from phytofit.engine.outcome import Estimate
+from phytofit.errors import ONE_LEAF_ONLY, NoPhytomerError, Status
 from phytofit.models import STEM, Organ, move
-from phytofit.objectives import Registration
-from phytofit.optimize import Generation
-from phytofit.outcome import Estimate
+from phytofit.paper.cross_entropy import Generation
+from phytofit.paper.objective import Registration
+from phytofit.results.remarks import FEW_ON_STEM, IMPLAUSIBLE, NEAR_BOUND, UNUSABLE, flags_of
 from phytofit.species import Species
 from phytofit.traits import CHORD_CM, Trait, measure
 
@@ -89,7 +89,7 @@ class Fit(Shown):
 
     def to_frame(self) -> "pd.DataFrame":
         """The traits as a table, with the columns of ``traits.csv``."""
-        from phytofit.results import trait_table
+        from phytofit.io import trait_table
 
         return trait_table(self.name, self.traits)
 

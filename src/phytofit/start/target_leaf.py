@@ -1,4 +1,4 @@
-"""Which points of a crowded cloud are of the phytomer that is meant: by seed points on its leaf."""
+"""Which points of a crowded cloud are of the target leaf and its stem: by seed points on its leaf."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -10,37 +10,37 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from phytofit.errors import NoPhytomerError, NoStemError, SettingError
-from phytofit.pose import StartPose, near_stem, with_tube
 from phytofit.segmentation.graph import coarse, geodesics, plant_graph
 from phytofit.segmentation.growing import grow
+from phytofit.start.pose import StartPose, near_stem, with_tube
 
-__all__ = ["Meant", "meant_points"]
+__all__ = ["TargetLeaf", "target_leaf_points"]
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 LINK, LINK_NEIGHBOR, LEAST_LINK_CM = 1.5, 8, 0.3  # points within so many typical distances of a neighbour are connected
 MANY = 100_000  # points; of more, one a voxel is enough
-LEAST_PIECE = 30  # points, or voxels; fewer are no piece of anything: those near to what is meant may be outliers
-NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf, and a stray point one of what is meant
+LEAST_PIECE = 30  # points, or voxels; fewer are no piece of anything: those near to the target leaf may be outliers
+NEAREST_CM = 3.0  # within which a seed point must have a point of a leaf, and a stray point one of the target leaf
 LIKELY = 0.25  # of the score of the most likely stem of all, from which that beside the seed is believed
 N_AROUND = 300  # points about a seed point, by which it is told how dense the leaf's are
 N_NODES = 8000  # to which the leaf and what touches it are thinned
-BESIDE_CM = 2.0  # a branch with most of its points so near to the leaf that is meant is a part of its blade
-NEAR_BASE_CM = 8.0  # along the stem, from the base of the leaf that is meant; of others so near, some points are left
+BESIDE_CM = 2.0  # a branch with most of its points so near to the target leaf is a part of its blade
+NEAR_BASE_CM = 8.0  # along the stem, from the base of the target leaf; of others so near, some points are left
 FEW_TOUCH = 5  # points, fewer of which may be there by chance
 NOBODY = -1  # piece
 
 
-class Meant(NamedTuple):
-    """Which points (n,) are meant, and whether others are so near that some of theirs may be left."""
+class TargetLeaf(NamedTuple):
+    """Which points (n,) are on it or its stem, and whether others are so near that some of theirs may be left."""
 
     points: BoolArray
     others_touch: bool
 
 
-def meant_points(
+def target_leaf_points(
     points: FloatArray, seed_points: FloatArray, find_starts: Callable[[FloatArray], list[StartPose]]
-) -> Meant:
+) -> TargetLeaf:
     """Which points (n, 3), cm, are of the stem or of a leaf on which seed points (k, 3) lie.
 
     The stem is looked for, with `find_starts`, among the points that are connected with a seed point, or among all if
@@ -50,13 +50,15 @@ def meant_points(
     Raises SettingError where a seed point is far from all points beside the stem, and what `find_starts` does.
     """
     if len(points) <= MANY:
-        return _meant(points, seed_points, find_starts)
+        return _on_target(points, seed_points, find_starts)
     first, stands_for = coarse(points)
-    meant, others_touch = _meant(points[first], seed_points, find_starts)
-    return Meant(meant[stands_for], others_touch)
+    target, others_touch = _on_target(points[first], seed_points, find_starts)
+    return TargetLeaf(target[stands_for], others_touch)
 
 
-def _meant(points: FloatArray, seed_points: FloatArray, find_starts: Callable[[FloatArray], list[StartPose]]) -> Meant:
+def _on_target(
+    points: FloatArray, seed_points: FloatArray, find_starts: Callable[[FloatArray], list[StartPose]]
+) -> TargetLeaf:
     tree = cKDTree(points)
     _check_near(tree.query(seed_points)[0])
     link = _link(tree, tree.query(seed_points, k=min(N_AROUND, len(points)))[1].ravel())
@@ -78,16 +80,16 @@ def _meant(points: FloatArray, seed_points: FloatArray, find_starts: Callable[[F
     leaf = piece.copy()
     leaf[connected[other > 0]] = piece.max() + other[other > 0]
     leaf[at_stem] = NOBODY
-    of_meant = np.isin(leaf, own)
-    of_others = (np.bincount(leaf + 1)[leaf + 1] >= LEAST_PIECE) & (leaf != NOBODY) & ~of_meant
-    far = cKDTree(upright[at_stem | of_meant]).query(upright)[0] > NEAREST_CM
-    return Meant(~(of_others | far), _touches(upright, at_stem, of_meant, of_others))
+    of_target = np.isin(leaf, own)
+    of_others = (np.bincount(leaf + 1)[leaf + 1] >= LEAST_PIECE) & (leaf != NOBODY) & ~of_target
+    far = cKDTree(upright[at_stem | of_target]).query(upright)[0] > NEAREST_CM
+    return TargetLeaf(~(of_others | far), _touches(upright, at_stem, of_target, of_others))
 
 
-def _touches(upright: FloatArray, at_stem: BoolArray, of_meant: BoolArray, of_others: BoolArray) -> bool:
-    """Whether points (n, 3) of others come near to the leaf that is meant, or to the stem about as high as that leaf
+def _touches(upright: FloatArray, at_stem: BoolArray, of_target: BoolArray, of_others: BoolArray) -> bool:
+    """Whether points (n, 3) of others come near to the target leaf, or to the stem about as high as that leaf
     does; at any height, where none of its points near the stem was seen."""
-    leaf, others = upright[of_meant], upright[of_others]
+    leaf, others = upright[of_target], upright[of_others]
     near_leaf = cKDTree(leaf).query(others)[0] < BESIDE_CM
     stem = cKDTree(upright[at_stem])
     base, beside = (points[stem.query(points)[0] < NEAREST_CM, 2] for points in (leaf, others))
@@ -139,7 +141,7 @@ def _of_other_branches(upright: FloatArray, seeds: FloatArray, foot: float) -> N
     """Of which branch that leads to no seed point each point (n,) is, from 1; 0 of none.
 
     The surface is grown from its ends towards the stem's foot at height `foot`, as whole plants are: where ends meet,
-    their branches unite.  What is meant are the branches on which seeds (k, 3) lie, all that these lead to down the
+    their branches unite.  What is target are the branches on which seeds (k, 3) lie, all that these lead to down the
     stem, and all that goes on beyond the outermost of them.
     """
     try:
@@ -159,12 +161,12 @@ def _of_other_branches(upright: FloatArray, seeds: FloatArray, foot: float) -> N
         while at is not None:
             outermost[at] = max(outermost.get(at, 0.0), float(distance[seed]))
             at = parent.get(at)
-    meant = list(outermost)
-    for i in meant:  # grows
+    target = list(outermost)
+    for i in target:  # grows
         reached = outermost.get(i, 0.0) - NEAREST_CM
-        meant += [child for child in regions[i].children if child not in outermost and regions[child].level >= reached]
+        target += [child for child in regions[i].children if child not in outermost and regions[child].level >= reached]
     of_point = branch[tree.query(upright)[1]]
-    other = ~np.isin(of_point, meant)
+    other = ~np.isin(of_point, target)
     whole = np.bincount(of_point[other], minlength=len(regions))
     beside = cKDTree(upright[~other]).query(upright[other])[0] < BESIDE_CM
     strip = 2 * np.bincount(of_point[other][beside], minlength=len(regions)) > whole  # of the same blade

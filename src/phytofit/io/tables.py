@@ -15,7 +15,7 @@ import pandas as pd
 from pandas.api.types import is_numeric_dtype
 
 from phytofit.errors import OutputError
-from phytofit.results.replacing import check_made, translated, whole_file
+from phytofit.io.replacing import check_made, translated, whole_file
 from phytofit.text import for_table, from_table, one_line
 
 __all__ = ["FolderTable", "check_table", "read_table", "table_text", "write_failures", "write_table", "write_workbook"]

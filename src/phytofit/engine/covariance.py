@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, pinvh
 
-from phytofit.dependence import Bell, Dependence
-from phytofit.intervals import covariance_of_independent
-from phytofit.likelihood import CloudLikelihood, Evaluation, State
+from phytofit.engine.dependence import Bell, Dependence
+from phytofit.engine.intervals import covariance_of_independent
+from phytofit.engine.likelihood import CloudLikelihood, Evaluation, State
 
 __all__ = ["covariance_of", "grown", "misfit_of", "mixed", "of_sensor", "shared_by_neighbors"]
 

@@ -1,29 +1,21 @@
-"""The most probable phytomer of a cloud: search, refine, choose the model."""
+"""The most probable phytomer of a cloud: refine from all starts, move on, choose the model."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import pinvh
-from scipy.spatial import cKDTree
 from scipy.special import expit
 
-from phytofit.beginnings import along_points, longer_leaf, longer_stem, lower_insertion, turned_blade
-from phytofit.covariance import of_sensor
-from phytofit.dependence import score_dependence
-from phytofit.distances import Reference, chamfer
-from phytofit.flags import OFFSET, along_stem, sighting
-from phytofit.hidden import Hidden
-from phytofit.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, State
-from phytofit.objectives import PaperObjective, minimise
-from phytofit.optimize import CrossEntropy, Generation
-from phytofit.outcome import Chosen, Elsewhere, Estimate, outcome
-from phytofit.refining import (
+from phytofit.engine.covariance import of_sensor
+from phytofit.engine.dependence import score_dependence
+from phytofit.engine.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, State
+from phytofit.engine.outcome import Chosen, Elsewhere, Estimate, outcome
+from phytofit.engine.refine import (
     COARSE_TOLERANCE,
     FEW_POINTS,
     Cloud,
@@ -33,10 +25,13 @@ from phytofit.refining import (
     refinement,
     terms,
 )
+from phytofit.engine.restarts import along_points, longer_leaf, longer_stem, lower_insertion, turned_blade
+from phytofit.engine.sighting import OFFSET, along_stem, sighting
+from phytofit.engine.tip import gain_of_blunt_end
+from phytofit.engine.visibility import Hidden
 from phytofit.species import Species
-from phytofit.tip import gain_of_blunt_end
 
-__all__ = ["DITHER_CM", "SCOUTING", "estimate"]
+__all__ = ["estimate"]
 
 FloatArray = NDArray[np.float64]
 COARSE_POINTS = 700  # that decide which start is the best
@@ -46,8 +41,6 @@ HELD_OUTLIERS, HELD_ITERATIONS = 0.1, 12  # at most, then, for each point of the
 HOPELESS = 0.3  # nats for each point, by which a start is behind after the first
 START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some cm off is drawn in
 CUT_SHARES = (0.85, 0.97)  # of the midrib, from which the search for a missing tip starts; the second of rich leaves
-DITHER_CM = 0.1  # added to points without noise
-N_PROBED = 300  # points around which it is seen whether there is any noise
 SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: fourteen parameters gain seven by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning must fit better
@@ -56,7 +49,6 @@ OF_START = (OFFSET, "leaf_base_bend", "leaf_angle")  # beyond its first twentiet
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
 LOWER_ROUNDS = 3
-SCOUTING: dict[str, Any] = {"scout_stride": 4, "tilts_deg": ()}  # of the search: few points, and no leaf from two sides
 LEAST_FACING = 1.0  # concentration, from which a stem was seen from one side: a half of it has 1.6
 
 
@@ -66,53 +58,21 @@ def estimate(
     starts: Sequence[tuple[FloatArray, FloatArray]],
     *,
     organ: NDArray[np.int8] | None = None,
-    n_samples: int = 60,
-    n_points: int = 200,
-    n_generations: int = 4,
-    elite_fraction: float = 0.1,
-    covariance_noise: float = 0.5,
-    seed: int = 0,
     executor: Executor | None = None,
-    progress: Callable[[Generation], None] | None = None,
 ) -> Estimate:
-    """Search, then refine: first the paper's model, then the one that real leaves need, and keep what the cloud backs.
+    """Refine from the starts: first the paper's model, then what real leaves need; keep what the cloud backs.
 
     Parameters
     ----------
-    points : (n, 3) cm, as seen from the first start
+    points : (n, 3) cm, which have some noise
     starts : mean (6 or 7,) and pose (4, 4) of the model's frame to begin from, each
     organ : (n,) 0 stem, 1 leaf, -1 unknown; None: all unknown
-    n_samples, n_points, n_generations : of the cross-entropy search that finds the basin
     """
-    given, points = points, _dithered(points, seed)
     plain = species.leading(len(starts[0][0]))
-    search = CrossEntropy(
-        plain.space,
-        n_samples=n_samples,
-        n_generations=n_generations,
-        elite_fraction=elite_fraction,
-        covariance_noise=covariance_noise,
-        mean=starts[0][0],
-        seed=seed,
-    )
-    stride = max(1, round(len(points) / n_points))
-    objective = PaperObjective(
-        plain.model,
-        Reference.of(points[::stride], None),
-        starts=[_at_junction(mean, pose) for mean, pose in starts],
-        n_points=n_points,
-        distance=chamfer,
-        **SCOUTING,
-        seed=seed,
-        executor=executor,
-    )
-    minimise(search, objective, progress)
-    registration, _ = objective.register(search.mean)
     cloud = Cloud(points, organ, executor)
-    state = _drawn_in(plain, cloud, [(search.mean, registration.T_target_source), *starts])
+    state = _drawn_in(plain, cloud, starts)
     chosen = _one_sided(_choice(_candidates(plain, species, cloud, state)))
-    chosen = _at_surface(species, _with_hidden_base(chosen))
-    return outcome(chosen, tuple(search.history), dithered=points is not given)
+    return outcome(_at_surface(species, _with_hidden_base(chosen)))
 
 
 def _drawn_in(plain: Species, cloud: Cloud, begun: Sequence[tuple[FloatArray, FloatArray]]) -> State:
@@ -302,20 +262,6 @@ def _at_surface(species: Species, chosen: Chosen) -> Chosen:
     )
 
 
-def _dithered(points: FloatArray, seed: int) -> FloatArray:
-    """The points (n, 3), with a little noise if they have next to none.
-
-    Without noise the scores say nothing of how fast the likelihood falls off, and the refinement gets stuck.
-    """
-    some = points[:: max(1, len(points) // N_PROBED)]
-    near = points[cKDTree(points).query(some, k=min(12, len(points)))[1]]
-    offset = near - near.mean(axis=1, keepdims=True)
-    rough = np.linalg.eigvalsh(np.einsum("nki,nkj->nij", offset, offset) / near.shape[1])[:, 0]
-    if np.sqrt(max(0.0, float(np.median(rough)))) >= 0.5 * DITHER_CM:
-        return points
-    return points + np.random.default_rng(seed).normal(0.0, DITHER_CM, points.shape)
-
-
 def _promise(species: Species, end: End, cloud: Cloud) -> float:
     """Log probability that a richer leaf is expected to gain over the fitted one, by Rao's score test."""
     likelihood = cloud.likelihood(species, cut=True, hidden=end.likelihood.hidden)
@@ -333,10 +279,3 @@ def _cut(state: State, share: float = CUT_SHARES[0]) -> State:
     theta[[3, 5]] /= share  # the bend is a thirtieth of the leaf's
     theta[state.n_parameters] = share
     return State(theta, state.pose, state.center)
-
-
-def _at_junction(mean: FloatArray, pose: FloatArray) -> FloatArray:
-    """The start as :class:`PaperObjective` takes it: with the junction of leaf and stem as its origin."""
-    at = pose.copy()
-    at[:3, 3] += pose[:3, 2] * mean[1]
-    return at

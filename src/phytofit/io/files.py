@@ -13,7 +13,7 @@ import numpy as np
 
 from phytofit.cloud import PointCloud
 from phytofit.errors import CloudError
-from phytofit.results.replacing import file_hash, whole_file
+from phytofit.io.replacing import file_hash, whole_file
 from phytofit.text import for_file_name, one_line
 
 __all__ = ["OURS", "files_made", "input_of", "is_our_picture", "json_text", "result_names", "write_text"]

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from phytofit.flags import across_leaf
-from phytofit.likelihood import CloudLikelihood, State
+from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.sighting import across_leaf
 from phytofit.models import move
 
 __all__ = ["MISFIT", "Ending", "PointsEnd", "combined", "ending", "points_end"]
