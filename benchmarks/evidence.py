@@ -28,6 +28,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
@@ -37,21 +38,15 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # each process works with one thr
 import numpy as np
 from common import DATA, progress
 from cut_leaves import Leaf, leaves
-from scipy.special import log_ndtr
 
 import phytofit
 from phytofit.engine.dependence import score_dependence
+from phytofit.engine.evidence import log_evidence
 from phytofit.engine.holes import find_holes
-from phytofit.engine.likelihood import (
-    N_EXTRA,
-    NO_THICKNESS_CM,
-    NOISE_CM,
-    NOISE_FACTOR,
-    THICKNESS,
-    CloudLikelihood,
-    State,
-)
-from phytofit.engine.scoring import refine
+from phytofit.engine.layout import Layout, State
+from phytofit.engine.posterior import Posterior
+from phytofit.engine.prior import NO_THICKNESS_CM, Prior
+from phytofit.engine.refine import refinement
 from phytofit.engine.search import estimate
 from phytofit.engine.visibility import Hidden
 from phytofit.fitting import mean_at
@@ -59,13 +54,14 @@ from phytofit.fitting import mean_at
 SPECIES = phytofit.load_species()
 K = len(SPECIES.space)
 N_GIVEN = 7  # parameters that every model has: those of Eq. (1), and the stem above the leaf
-SHAPE = (*SPECIES.space.names[N_GIVEN:], "thickness")
-PLACE = {name: N_GIVEN + i for i, name in enumerate(SHAPE)} | {"thickness": K + N_EXTRA + THICKNESS}  # in theta
-NEUTRAL = {**dict(zip(SHAPE, SPECIES.model.neutral[N_GIVEN:], strict=False)), "thickness": np.log(NO_THICKNESS_CM)}
-LEARNED = [*range(K), PLACE["thickness"]]  # places in theta whose prior is learned
+SHAPE = (*SPECIES.space.names[N_GIVEN:], "leaf_thickness")
+LAYOUT = Layout(SPECIES.space.names)
+PLACE = {name: LAYOUT.place(name) for name in SHAPE}  # in theta
+NEUTRAL = {**dict(zip(SHAPE, SPECIES.model.neutral[N_GIVEN:], strict=False)), "leaf_thickness": np.log(NO_THICKNESS_CM)}
+LEARNED = [*range(K), PLACE["leaf_thickness"]]  # places in theta whose prior is learned
 SIDEWAYS = [PLACE[name] for name in ("leaf_side_bend", "leaf_side_bow", "leaf_roll", "leaf_twist")]
 HELD: dict[str, tuple[str, ...]] = {"full": (), **{name: (name,) for name in SHAPE}, "all of them": SHAPE}
-POSE, POSE_STD = slice(-13, -7), np.array([3.0] * 3 + [50.0] * 3)  # radians, cm: next to nothing is known
+POSE_STD = {"turn": 3.0, "shift": 50.0}  # radians, cm: next to nothing is known
 WIDER = 3.0  # times the species file's spreads, for the fits that priors are learned from
 FLOOR = 0.2  # of the species file's spreads: a learned one is not narrower
 BEGUN_ANGLE, BEGUN_BEND, BEGUN_ROLL = (15.0, 60.0), (0.0, 4.0, 8.0), (0.0, 80.0)
@@ -90,14 +86,15 @@ class Fitted(NamedTuple):
     inflation: float
 
 
-class Prior(NamedTuple):
+class Learned(NamedTuple):
     """Means and spreads of `LEARNED`."""
 
     mean: np.ndarray
     std: np.ndarray
 
 
-FILE = Prior(np.append(SPECIES.space.mean, np.log(NOISE_CM)), np.append(SPECIES.space.std, np.log(NOISE_FACTOR)))
+THICK = Prior.of(SPECIES.space, thick=True)
+FILE = Learned(THICK.mean[LEARNED], THICK.std[LEARNED])
 WIDE = FILE._replace(std=WIDER * FILE.std)
 
 
@@ -105,55 +102,34 @@ def neutral(held: Iterable[str]) -> dict[str, float]:
     return {name: NEUTRAL[name] for name in held}
 
 
-def likelihood_of(fitted: Fitted, held: dict[str, float], prior: Prior) -> CloudLikelihood:
+def likelihood_of(fitted: Fitted, held: dict[str, float], prior: Learned) -> Posterior:
     """Of the leaf under a model with parameters `held`; errors of points that depend on each other count once."""
     leaf = fitted.leaf
-    made = CloudLikelihood(
-        SPECIES.model,
-        SPECIES.space,
+    made = Posterior.of(
+        SPECIES,
         leaf.points,
         organ=leaf.organ,
         weights=np.full(len(leaf.points), 1.0 / fitted.inflation),
         thick=True,
         hidden=fitted.hidden,
     )
-    made.mean[LEARNED] = np.clip(prior.mean, made.lower[LEARNED], made.upper[LEARNED])
-    made.precision[LEARNED] = prior.std**-2.0
-    made.precision[POSE] = POSE_STD**-2.0
+    mean, std, lower, upper = (values.copy() for values in (THICK.mean, THICK.std, THICK.lower, THICK.upper))
+    mean[LEARNED] = np.clip(prior.mean, lower[LEARNED], upper[LEARNED])
+    std[LEARNED] = prior.std
+    for name, spread in POSE_STD.items():
+        std[LAYOUT[name]] = spread
     for name, value in held.items():
-        i = PLACE[name]
-        made.mean[i] = made.lower[i] = made.upper[i] = value
-    return made
+        mean[PLACE[name]] = lower[PLACE[name]] = upper[PLACE[name]] = value
+    return made.under(replace(THICK, mean=mean, std=std, lower=lower, upper=upper))
 
 
-def refined(likelihood: CloudLikelihood, state: State, max_iterations: int = 60) -> State:
-    def evaluate(theta: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-        at = likelihood.evaluate(likelihood.with_theta(state, theta))
-        weighted = at.scores * likelihood.weights[:, np.newaxis]
-        gradient = (theta - likelihood.mean) * likelihood.precision - weighted.sum(axis=0)
-        return at.error, gradient, at.scores.T @ weighted + np.diag(likelihood.precision)
-
-    end = refine(evaluate, state.theta, lower=likelihood.lower, upper=likelihood.upper, max_iterations=max_iterations)
-    return likelihood.with_theta(state, end.theta)
+def refined(likelihood: Posterior, state: State, max_iterations: int = 60) -> State:
+    return state.at(refinement(likelihood, state, max_iterations=max_iterations).theta)
 
 
-def log_evidence(likelihood: CloudLikelihood, state: State) -> float:
+def evidence_of(likelihood: Posterior, state: State) -> float:
     """log p(cloud | model, prior) by Laplace's approximation of what lies within the bounds; up to a constant."""
-    free = likelihood.lower < likelihood.upper
-    at = likelihood.evaluate(state)
-    weighted = (at.scores * likelihood.weights[:, np.newaxis])[:, free]
-    theta, mean, precision = (values[free] for values in (state.theta, likelihood.mean, likelihood.precision))
-    lower, upper = likelihood.lower[free], likelihood.upper[free]
-    covariance = np.linalg.inv(at.scores[:, free].T @ weighted + np.diag(precision))
-    gradient = (theta - mean) * precision - weighted.sum(axis=0)
-    step = covariance @ gradient  # to the normal distribution's middle, which lies beyond a bound that is met
-    std = np.sqrt(np.diag(covariance))
-    inside = log_ndtr((theta - step - lower) / std) + log_ndtr((upper - theta + step) / std)
-    known = precision > 0.0
-    before = np.sqrt(precision[known])
-    inside_before = log_ndtr((mean - lower)[known] * before) + log_ndtr((upper - mean)[known] * before)
-    volume = 0.5 * np.linalg.slogdet(covariance)[1] + np.log(before).sum()
-    return float(-at.error + 0.5 * gradient @ step + volume + inside.sum() - inside_before.sum())
+    return log_evidence(likelihood, state, likelihood.evaluate(state))
 
 
 def beginnings(leaf: Leaf) -> list[State]:
@@ -169,20 +145,33 @@ def beginnings(leaf: Leaf) -> list[State]:
     found = []
     for held, rolls in ((SHAPE, (0.0,)), ((), BEGUN_ROLL)):
         likelihood = likelihood_of(rough, neutral(held), WIDE)
-        likelihood.lower[-5:-3] = np.log(COARSE_NOISE_CM)
-        likelihood.upper[-1] = COARSE_OUTLIERS
+        prior = likelihood.prior.bounded("outlier_share", upper=COARSE_OUTLIERS)
+        for name, least in zip(("stem_noise", "leaf_noise"), np.log(COARSE_NOISE_CM), strict=True):
+            prior = prior.bounded(name, lower=float(least))
+        likelihood = likelihood.under(prior)
         ends = []
         for i, angle, bend, roll in product(range(len(means)), BEGUN_ANGLE, BEGUN_BEND, rolls):
             x = means[i].copy()
-            x[[0, 2, 5, PLACE["leaf_roll"]]] = 2.0 * leaf.starts[i].radius, angle, bend, roll
+            begun = {"stem_diameter": 2.0 * leaf.starts[i].radius, "leaf_angle": angle}
+            for name, value in (begun | {"leaf_rotate_angle": bend, "leaf_roll": roll}).items():
+                x[LAYOUT.place(name)] = value
             ends.append(refined(likelihood, likelihood.start(x, feet[i], START_NOISE_CM), max_iterations=30))
         found.append(min(ends, key=partial(error_at, likelihood)))
     with suppress(np.linalg.LinAlgError), np.errstate(invalid="ignore"):  # a leaf may collapse
         starts = [(mean[:N_GIVEN], foot) for mean, foot in zip(means, feet, strict=True)]
         made = estimate(SPECIES, leaf.points, starts, organ=leaf.organ)
         state = likelihood.start(made.x, made.pose, 1.0)
-        state.theta[-5:] = [*np.log(made.noise), *np.log(made.share[[0, 2]] / made.share[1])]
-        found.append(state)
+        stem, leaf_noise, thickness = np.log(made.noise)
+        on_stem, _, outlier = np.log(made.share / made.share[1])
+        found.append(
+            state.changed(
+                stem_noise=stem,
+                leaf_noise=leaf_noise,
+                leaf_thickness=thickness,
+                stem_share=on_stem,
+                outlier_share=outlier,
+            )
+        )
     return found
 
 
@@ -192,18 +181,18 @@ def fit_leaf(leaf: Leaf) -> Fitted:
     likelihood = likelihood_of(fitted, {}, WIDE)
     state = best_end(likelihood, beginnings(leaf))
     for _ in range(HOLE_ROUNDS):
-        fitted = fitted._replace(hidden=find_holes(likelihood, state, likelihood.evaluate(state).scores))
+        fitted = fitted._replace(hidden=find_holes(likelihood, state, likelihood.evaluate(state)))
         likelihood = likelihood_of(fitted, {}, WIDE)
         state = refined(likelihood, state)
     fitted = fitted._replace(inflation=score_dependence(likelihood, state).inflation)
     likelihood = likelihood_of(fitted, {}, WIDE)
-    blurred = State(state.theta.copy(), state.pose, state.center)
-    blurred.theta[-5:-3] += np.log(BLUR)
+    more = np.log(BLUR)
+    blurred = state.changed(stem_noise=state["stem_noise"] + more, leaf_noise=state["leaf_noise"] + more)
     models = {model: likelihood_of(fitted, neutral(held), WIDE) for model, held in HELD.items()}
     return fitted._replace(states=at_rest(models, {model: [state, blurred] for model in HELD}))
 
 
-def at_rest(models: dict[str, CloudLikelihood], begun: dict[str, list[State]]) -> dict[str, State]:
+def at_rest(models: dict[str, Posterior], begun: dict[str, list[State]]) -> dict[str, State]:
     """Where each model comes to rest: the best of its own beginnings, and of where the full model came to rest.
 
     An optimum that one model finds and another misses would count as a gain or a loss of a parameter that has no part
@@ -221,16 +210,16 @@ def at_rest(models: dict[str, CloudLikelihood], begun: dict[str, list[State]]) -
     return states
 
 
-def best_end(likelihood: CloudLikelihood, begun: Sequence[State]) -> State:
+def best_end(likelihood: Posterior, begun: Sequence[State]) -> State:
     return min((refined(likelihood, state) for state in begun), key=partial(error_at, likelihood))
 
 
-def error_at(likelihood: CloudLikelihood, state: State) -> float:
-    inside = np.clip(state.theta, likelihood.lower, likelihood.upper)
-    return likelihood.evaluate(likelihood.with_theta(state, inside), derivatives=False).error
+def error_at(likelihood: Posterior, state: State) -> float:
+    inside = np.clip(state.theta, likelihood.prior.lower, likelihood.prior.upper)
+    return likelihood.evaluate(state.at(inside), derivatives=False).error
 
 
-def learned(others: Sequence[Fitted], model: str) -> Prior:
+def learned(others: Sequence[Fitted], model: str) -> Learned:
     """From fits of the model, step 3; a leaf counts together with its mirror image."""
     values = np.array([it.states[model].theta[LEARNED] for it in others])
     mirrored = values.copy()
@@ -242,10 +231,10 @@ def learned(others: Sequence[Fitted], model: str) -> Prior:
         for q in (0.1, 0.5, 0.9)
     )
     middle[SIDEWAYS] = 0.0
-    return Prior(middle, np.maximum((high - low) / CENTRAL, FLOOR * FILE.std))
+    return Learned(middle, np.maximum((high - low) / CENTRAL, FLOOR * FILE.std))
 
 
-def gains(job: tuple[Fitted, dict[str, Prior]]) -> Gains:
+def gains(job: tuple[Fitted, dict[str, Learned]]) -> Gains:
     """Of one leaf: by how much its log evidence under the full model is above that with the parameters `HELD` at their
     neutral values, and at the others' medians."""
     fitted, priors = job
@@ -259,7 +248,7 @@ def gains(job: tuple[Fitted, dict[str, Prior]]) -> Gains:
     }
     begun = {model: [fitted.states[model.removesuffix(", constant")]] for model in models | constant}
     states = at_rest(models | constant, begun)
-    evidence = {model: log_evidence(it, states[model]) for model, it in (models | constant).items()}
+    evidence = {model: evidence_of(it, states[model]) for model, it in (models | constant).items()}
     return {
         model: (evidence["full"] - evidence[model], evidence["full"] - evidence[f"{model}, constant"])
         for model, held in HELD.items()

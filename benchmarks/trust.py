@@ -32,7 +32,7 @@ from scipy.spatial import cKDTree
 import phytofit
 import phytofit.models
 import phytofit.simulation
-from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.posterior import Posterior
 from phytofit.models.organs import frames_along
 
 SPECIES = phytofit.load_species()
@@ -103,7 +103,7 @@ def cramer_rao(made: phytofit.SimulatedPhytomer, job: Job) -> np.ndarray:
     points, _ = phytofit.models.SurfaceSampler(BOUND_SAMPLE, 1).draw(made.organs)
     points = points + random.normal(0.0, job.noise_cm, points.shape)
     species = SPECIES.leading(N_PARAMETERS)
-    likelihood = CloudLikelihood(species.model, species.space, points)
+    likelihood = Posterior.of(species, points)
     state = likelihood.start(made.x[:N_PARAMETERS], made.pose, job.noise_cm)
     theta = state.theta.copy()
     stem, leaf = (organ.area for organ in made.organs)

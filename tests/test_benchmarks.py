@@ -7,17 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import integrate, stats
 from scipy.spatial import cKDTree
 
 import phytofit
 import phytofit.start.pose
-from phytofit.engine.likelihood import Evaluation, State
 from phytofit.models import move
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 SAME = 1e-9  # cm; the same sums in the same order
-LAPLACE = 0.02  # nats; exact but at a bound, where the scores' outer product is not quite the curvature
 AT_REST = 1e-6  # cm; the source is a part of the reference
 
 
@@ -188,40 +185,6 @@ def test_maize_leaves_lie_along_their_true_organs():
         rho = np.hypot(leaf.points[:, 0], leaf.points[:, 1])
         assert np.all((near < blade.half_width.max() + 2.0) | (rho < stem.half_width.max() + 1.5)), leaf.name
         assert 10.0 < blade.segment_lengths.sum() < 130.0
-
-
-class Bounded:
-    """Numbers of a normal distribution, mean unknown within bounds, as a likelihood that has nothing else."""
-
-    def __init__(self, values, mean, std, lower, upper):
-        self.values, self.weights = values, np.ones(len(values))
-        self.mean, self.precision = np.array([mean]), np.array([std**-2.0])
-        self.lower, self.upper = np.array([lower]), np.array([upper])
-
-    def evaluate(self, state):
-        off = self.values - state.theta
-        log_p = -0.5 * off**2 - 0.5 * np.log(2.0 * np.pi)
-        error = 0.5 * float(np.sum((state.theta - self.mean) ** 2 * self.precision)) - log_p.sum()
-        return Evaluation(error, off[:, np.newaxis], log_p)
-
-
-@pytest.mark.parametrize(("lower", "upper"), [(-50.0, 50.0), (0.9, 9.0), (-9.0, 1.3), (1.05, 30.0)])
-def test_evidence_is_the_integral_over_what_lies_within_the_bounds(lower, upper):
-    evidence = load("evidence")
-    values = 1.0 + np.array([-1.0, 1.0] * 8)  # of variance 1: the scores' outer product is the curvature
-    mean, std = 2.0, 3.0
-    likelihood = Bounded(values, min(mean, upper), std, lower, upper)
-    prior = stats.truncnorm(
-        (lower - likelihood.mean[0]) / std, (upper - likelihood.mean[0]) / std, likelihood.mean, std
-    )
-
-    def density(x):
-        return float(np.exp(np.sum(stats.norm.logpdf(values, x)) + 30.0) * prior.pdf(x)[0])
-
-    integral = integrate.quad(density, max(lower, -3.0), min(upper, 5.0), epsabs=0.0)[0]
-    best = np.clip([(values.sum() + likelihood.mean[0] / 9.0) / (len(values) + 1.0 / 9.0)], lower, upper)
-    state = State(best, np.eye(4), np.zeros(3))
-    assert evidence.log_evidence(likelihood, state) == pytest.approx(np.log(integral) - 30.0, abs=LAPLACE)
 
 
 def test_a_leaf_is_cut_with_its_piece_of_stem_and_scaled():

@@ -1,12 +1,14 @@
 """Covariance of an estimate where a parameter lies at its bound, and the misfit of a blade."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import phytofit
 from phytofit.engine.covariance import covariance_of, misfit_of, mixed
 from phytofit.engine.dependence import NONE, Bell, Dependence, score_dependence
-from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.refine import refinement
 from phytofit.engine.scoring import refine
 
@@ -46,22 +48,22 @@ def test_errors_that_stem_and_leaf_share_are_no_misfit_of_the_blade():
 
 def at_rest(made, upper_taper):
     """The full model at its maximum, with a bound of the taper; the blade is known to be wide, not how it narrows."""
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
-    likelihood.upper[NAMES.index("leaf_taper")] = upper_taper
+    likelihood = Posterior.of(SPECIES, made.points)
+    likelihood = likelihood.under(likelihood.prior.bounded("leaf_taper", upper=upper_taper))
     state = likelihood.start(made.x, made.pose, 0.3)
 
     def evaluate(theta):
-        at = likelihood.evaluate(likelihood.with_theta(state, theta))
-        information = at.scores.T @ at.scores + np.diag(likelihood.precision)
-        return at.error, likelihood.gradient(likelihood.with_theta(state, theta), at), information
+        at = likelihood.evaluate(state.at(theta))
+        information = at.scores.T @ at.scores + np.diag(likelihood.prior.precision)
+        return at.error, likelihood.gradient(state.at(theta), at), information
 
-    theta = refine(evaluate, state.theta, lower=likelihood.lower, upper=likelihood.upper).theta
-    state = likelihood.with_theta(state, theta)
+    theta = refine(evaluate, state.theta, lower=likelihood.prior.lower, upper=likelihood.prior.upper).theta
+    state = state.at(theta)
     return likelihood, state, likelihood.evaluate(state)
 
 
 def at_maximum(likelihood, start):
-    state = likelihood.with_theta(start, refinement(likelihood, start, max_iterations=200, tolerance=1e-9).theta)
+    state = start.at(refinement(likelihood, start, max_iterations=200, tolerance=1e-9).theta)
     return state, likelihood.evaluate(state)
 
 
@@ -70,17 +72,17 @@ def test_points_that_err_alike_and_a_prior_that_counts_as_often_say_what_the_poi
     """The oracle is the cloud itself: each of its points three times over tells nothing new."""
     species = SPECIES.leading(7)
     once = phytofit.simulate(fixed={"stem_length_above": 9.0}, n_points=300, noise_cm=0.5, seed=seed)
-    few = CloudLikelihood(species.model, species.space, once.points)
-    few.precision *= SURER
-    few.mean[:7] = once.x[:7]
+    few = Posterior.of(species, once.points)
+    mean = np.append(once.x[:7], few.prior.mean[7:])
+    few = few.under(replace(few.prior, mean=mean, std=few.prior.std / np.sqrt(SURER)))
     state, at = at_maximum(few, few.start(once.x[:7], once.pose, 0.5))
     one, _ = covariance_of(few, state, at, Dependence(at.scores.T @ at.scores, 1.0, 1e12, NONE, NONE))
 
-    many = CloudLikelihood(species.model, species.space, np.tile(once.points, (3, 1)))
-    many.precision, many.mean = few.precision, few.mean
+    many = Posterior.of(species, np.tile(once.points, (3, 1)))
+    many = many.under(few.prior)
     light, _ = at_maximum(many, state)
     assert np.abs(light.x - state.x).max() > 0.02  # there the prior counts for less
-    many = many.with_prior(np.ones(len(few.mean), bool), 3.0)
+    many = many.under(many.prior.weighted(np.ones(len(few.prior.mean), bool), 3.0))
     there, at = at_maximum(many, light)
     np.testing.assert_allclose(there.theta, state.theta, atol=1e-3)
     alike = Dependence(3.0 * at.scores.T @ at.scores, 3.0, 1e12, NONE, NONE)
@@ -95,9 +97,12 @@ def test_what_a_prior_takes_to_a_bound_is_as_uncertain_as_the_prior(made):
     the prior has its middle and about its end, is no news."""
     i = NAMES.index("collar_offset")
     kept = np.linalg.norm(made.points - made.organs[1].axis[0], axis=1) > 4.0
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, made.points[kept])
-    careful = likelihood.with_prior(np.arange(len(likelihood.mean)) == i, 500.0)
-    careful.lower[i] = 0.05
+    likelihood = Posterior.of(SPECIES, made.points[kept])
+    careful = likelihood.under(
+        likelihood.prior.weighted(likelihood.prior.layout.mask("collar_offset"), 500.0).bounded(
+            "collar_offset", lower=0.05
+        )
+    )
     state, at = at_maximum(careful, likelihood.start(made.x, made.pose, 0.3))
     assert state.theta[i] == 0.05
     alike = Dependence(500.0 * at.scores.T @ at.scores, 500.0, 1e12, NONE, NONE)
@@ -124,7 +129,7 @@ def test_others_do_not_follow_a_parameter_that_its_bound_holds(made):
     assert np.all(np.abs(found[i, others]) < 0.1 * np.sqrt(found[i, i] * np.diag(found)[others] + 1e-12))
     assert found[i, i] > 0.0
 
-    likelihood.lower[i] = likelihood.upper[i]
+    likelihood.prior.lower[i] = likelihood.prior.upper[i]
     without, _ = covariance_of(likelihood, state, at, known)
     np.testing.assert_allclose(np.diag(found)[others], np.diag(without)[others], rtol=0.05)
 

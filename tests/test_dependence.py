@@ -6,7 +6,8 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
 from phytofit.engine.dependence import NONE, Bell, _before_the_fit, _correlation, score_dependence, width_misfit
-from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.layout import State
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.refine import refinement
 from phytofit.models import SurfaceSampler, move
 from phytofit.species import load_species
@@ -41,7 +42,7 @@ def scene(seed, *, n=600, k=7, width_cm=1.0, share=0.0, noise_cm=NOISE_CM):
     stem, leaf = organs = [organ.row(0) for organ in species.model.organs(X[:k])]
     points, _ = SurfaceSampler(n, seed, even=False).draw(organs)
     errors = smooth_noise(points, width_cm, share, random) if share else random.normal(size=points.shape)
-    likelihood = CloudLikelihood(species.model, species.space, points + noise_cm * errors)
+    likelihood = Posterior.of(species, points + noise_cm * errors)
     state = likelihood.start(X[:k], np.eye(4), noise_cm)
     state.theta[-2:] = np.log(stem.area / leaf.area), np.log(0.01)
     return likelihood, state
@@ -49,14 +50,14 @@ def scene(seed, *, n=600, k=7, width_cm=1.0, share=0.0, noise_cm=NOISE_CM):
 
 def fitted(likelihood, state):
     """The state where the likelihood is greatest: its errors are what a fit leaves of the true ones."""
-    return likelihood, State(refinement(likelihood, state).theta, state.pose, state.center)
+    return likelihood, state.at(refinement(likelihood, state).theta)
 
 
 def in_standard_errors(likelihood, state, variability):
     """A covariance (k, k) of the scores' sum, with the prior's, in units of that of independent points."""
     scores = likelihood.evaluate(state).scores
-    root = np.linalg.cholesky(scores.T @ scores + np.diag(likelihood.precision + 1e-9))
-    whole = variability + np.diag(likelihood.precision)
+    root = np.linalg.cholesky(scores.T @ scores + np.diag(likelihood.prior.precision + 1e-9))
+    whole = variability + np.diag(likelihood.prior.precision)
     return np.linalg.solve(root, np.linalg.solve(root, whole).T)
 
 
@@ -93,7 +94,7 @@ def test_the_inflation_is_that_of_many_clouds():
         independent += scores.T @ scores / 100.0
         if seed % 10 == 0:
             estimates.append(score_dependence(*fitted(likelihood, state)).inflation)
-    prior = np.diag(likelihood.precision)
+    prior = np.diag(likelihood.prior.precision)
     varied = np.linalg.solve(independent + prior + 1e-9 * np.eye(len(prior)), np.cov(np.transpose(sums)) + prior)
     inflation = np.trace(varied) / len(prior)
     assert inflation > 2.0
@@ -136,7 +137,7 @@ def test_a_cloud_may_lie_anywhere():
     there[:3, :3] = Rotation.random(rng=np.random.default_rng(0)).as_matrix()
     there[:3, 3] = [300.0, -200.0, 100.0]
     moved = likelihood.at(likelihood.points @ there[:3, :3].T + there[:3, 3])
-    turned = State(state.theta, there @ state.pose, there[:3, :3] @ state.center + there[:3, 3])
+    turned = State(state.theta, state.layout, there @ state.pose, there[:3, :3] @ state.center + there[:3, 3])
     here, away = score_dependence(likelihood, state), score_dependence(moved, turned)
     assert away.leaf.reach_cm == here.leaf.reach_cm
     assert away.leaf.correlation == pytest.approx(here.leaf.correlation, rel=1e-6)
@@ -162,7 +163,7 @@ def test_misfit_counts_as_correlation():
     organs = move([organ.row(0) for organ in SPECIES.model.organs(bent)], np.eye(4))
     points, _ = SurfaceSampler(600, 3, even=False).draw(organs)
     points += random.normal(0.0, NOISE_CM, points.shape)
-    likelihood = CloudLikelihood(species.model, species.space, points)
+    likelihood = Posterior.of(species, points)
     found = score_dependence(*fitted(likelihood, likelihood.start(X[:7], np.eye(4), 2.0 * NOISE_CM)))
     assert found.leaf.reach_cm > 1.0
     assert found.inflation > 2.0
@@ -172,7 +173,7 @@ def test_stem_and_leaf_are_correlated_each_by_itself():
     """Errors of the leaf alone that are averages: the stem's diameter is as sure as it was, the leaf's is not."""
     likelihood, state = scene(4, n=1500)
     random = np.random.default_rng(0)
-    on_leaf = likelihood.evaluate(state).scores[:, -2] + state.share[0] < 0.5
+    on_leaf = likelihood.evaluate(state).responsibilities[:, 0] < 0.5
     rough = likelihood.points.copy()
     rough[on_leaf] += 0.4 * smooth_noise(rough[on_leaf], 1.0, 1.0, random)
     moved = likelihood.at(rough)
@@ -267,7 +268,7 @@ def test_width_misfit_is_beyond_what_shared_noise_does():
     found = []
     for seed in range(4):
         likelihood, state = scene(seed, n=1500, width_cm=1.0, share=1.0, noise_cm=1.0)
-        scores = likelihood.evaluate(state).scores
-        found.append([width_misfit(likelihood, state, scores, bell) for bell in (NONE, Bell(1.0, 1.4))])
+        at = likelihood.evaluate(state)
+        found.append([width_misfit(likelihood, state, at, bell) for bell in (NONE, Bell(1.0, 1.4))])
     alone, shared = np.mean(found, axis=0)
     assert shared < 0.5 * alone

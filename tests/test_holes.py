@@ -6,7 +6,7 @@ from scipy.stats import ttest_1samp
 
 import phytofit
 from phytofit.engine.holes import find_holes
-from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.visibility import Hidden, cells
 from phytofit.models import LEAF, Organ
 from phytofit.models.organs import frames_along
@@ -47,10 +47,10 @@ def made(seed, hole=None, n_points=5000):
 
 
 def found_in(true, points):
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    likelihood = Posterior.of(SPECIES, points)
     state = likelihood.start(true.x[:7], true.pose, NOISE_CM)
     state.theta[-2] = np.log(0.4)
-    return find_holes(likelihood, state, likelihood.evaluate(state).scores)
+    return find_holes(likelihood, state, likelihood.evaluate(state))
 
 
 def test_a_share_that_rises_evenly_is_given_back_in_between_and_stays_beyond_the_ends():

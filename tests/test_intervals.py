@@ -8,7 +8,7 @@ from scipy.stats import norm
 import phytofit
 from phytofit.engine.dependence import NONE, width_misfit
 from phytofit.engine.intervals import covariance_of_independent, propagated
-from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.posterior import Posterior
 
 ROUNDING = 1e-9
 DRAWN = 0.05  # relative; quantiles of a hundred thousand draws, and what is lost by looking along axes only
@@ -60,14 +60,14 @@ def test_width_is_as_the_model_has_it_or_it_is_not():
     species = phytofit.load_species()
     made = phytofit.simulate(n_points=5000, noise_cm=0.3, seed=3)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
-    likelihood = CloudLikelihood(species.model, species.space, points)
+    likelihood = Posterior.of(species, points)
     state = likelihood.start(made.x, np.eye(4), 0.3)
-    assert width_misfit(likelihood, state, likelihood.evaluate(state).scores, NONE) < 0.03
+    assert width_misfit(likelihood, state, likelihood.evaluate(state), NONE) < 0.03
     leaf = points[made.labels == 2]
     waved = points.copy()
     waved[made.labels == 2, 1] *= 1.0 + 0.1 * np.sqrt(2.0) * np.sin(leaf[:, 0])  # the blade lies across y
     moved = likelihood.at(waved)
-    assert width_misfit(moved, state, moved.evaluate(state).scores, NONE) == pytest.approx(0.1, abs=0.035)
+    assert width_misfit(moved, state, moved.evaluate(state), NONE) == pytest.approx(0.1, abs=0.035)
 
 
 def scores_of(n, seed, steeper=1.0):

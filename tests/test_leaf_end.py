@@ -8,7 +8,7 @@ import pytest
 import phytofit
 from phytofit.engine import leaf_end
 from phytofit.engine.leaf_end import MISFIT, PointsEnd, combined, ending, points_end
-from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.visibility import N_STRIPS, Hidden
 from phytofit.models import Organ, move
 from phytofit.models.organs import frames_along
@@ -37,15 +37,15 @@ def scene(seed, *, end=0.85, power=1.0, gone=(1.0, 1.0), told=True, n_points=600
     middle = (np.arange(len(leaf.frame)) + 0.5) / len(leaf.frame)
     share = np.where((middle > gone[0]) & (middle < gone[1]), 1.0, 0.0)
     hidden = Hidden(leaf, np.repeat(share[:, np.newaxis], N_STRIPS, axis=1)) if told and share.any() else None
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points, hidden=hidden)
+    likelihood = Posterior.of(SPECIES, points, hidden=hidden)
     state = likelihood.start(made.x, made.pose, NOISE_CM)
     theta = state.theta.copy()
     theta[-2:] = np.log(float(stem.area) / float(leaf.area)), -6.0
-    return likelihood, likelihood.with_theta(state, theta), end * length
+    return likelihood, state.at(theta), end * length
 
 
 def end_of(likelihood, state):
-    return points_end(likelihood, state, likelihood.evaluate(state).scores)
+    return points_end(likelihood, state, likelihood.evaluate(state))
 
 
 @pytest.mark.parametrize("power", [0.2, 0.6, 1.0, 1.6])
@@ -71,7 +71,7 @@ def test_a_model_that_is_too_short_has_no_part_in_it(short):
         likelihood, state, true = scene(seed, end=0.95, power=0.6)
         theta = state.theta.copy()
         theta[3] *= 0.95 * short
-        told = end_of(likelihood, likelihood.with_theta(state, theta))
+        told = end_of(likelihood, state.at(theta))
         off.append(told.at - true)
         error.append(told.error)
     assert abs(np.mean(off)) < 0.6
@@ -80,9 +80,9 @@ def test_a_model_that_is_too_short_has_no_part_in_it(short):
 
 def test_an_error_that_the_points_share_is_the_ends_too():
     likelihood, state, _ = scene(6, end=0.97)
-    scores, covariance = likelihood.evaluate(state).scores, 1e-9 * np.eye(len(state.theta))
+    at, covariance = likelihood.evaluate(state), 1e-9 * np.eye(len(state.theta))
     covariance[3, 3] = 4.0
-    own, shared = (ending(likelihood, state, scores, covariance, cm) for cm in (0.0, 1.0))
+    own, shared = (ending(likelihood, state, at, covariance, cm) for cm in (0.0, 1.0))
     assert (covariance + shared.changed)[3, 3] > (covariance + own.changed)[3, 3] + 0.1
 
 
@@ -94,7 +94,7 @@ def test_the_model_has_no_part_in_it(end):
     theta = state.theta.copy()
     theta[4] *= 1.3  # its width
     theta[3] *= 1.05
-    longer = end_of(likelihood, likelihood.with_theta(state, theta))
+    longer = end_of(likelihood, state.at(theta))
     assert longer.at == pytest.approx(told.at, abs=told.error)
 
 
@@ -117,7 +117,7 @@ def test_too_few_points_tell_nothing():
     assert end_of(likelihood, state) is None
     covariance = 1e-9 * np.eye(len(state.theta))
     covariance[3, 3] = 0.01
-    alone = ending(likelihood, state, likelihood.evaluate(state).scores, covariance)
+    alone = ending(likelihood, state, likelihood.evaluate(state), covariance)
     assert alone.share == 1.0
     assert (covariance + alone.changed)[3, 3] == pytest.approx(0.01 + (MISFIT * state.x[3]) ** 2, rel=0.01)
 
@@ -144,11 +144,11 @@ def test_where_they_disagree_the_points_are_right():
 
 def test_the_end_narrows_what_is_known_of_the_tip_and_nothing_else():
     likelihood, state, _ = scene(4, end=0.99, power=0.6)
-    scores = likelihood.evaluate(state).scores
+    at = likelihood.evaluate(state)
     k = len(state.theta)
     covariance = np.diag(np.full(k, 1e-4))
     covariance[3, 3] = 4.0  # of the length: of a straight leaf, the tip's place
-    found = ending(likelihood, state, scores, covariance)
+    found = ending(likelihood, state, at, covariance)
     told = end_of(likelihood, state)
     after = covariance + found.changed
     assert np.linalg.eigvalsh(after).min() > 0.0

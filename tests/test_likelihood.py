@@ -11,11 +11,12 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from phytofit.engine import likelihood as module
-from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine import mixture as module
+from phytofit.engine.layout import State
+from phytofit.engine.mixture import Mixture, Side, Strip, Tube
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.visibility import Hidden
 from phytofit.engine.voids import Void
-from phytofit.kernels.likelihood import log_density
 from phytofit.models import LEAF, STEM, Organ, Phytomer, SurfaceSampler, move
 from phytofit.models.organs import frames_along
 from phytofit.species import load_species
@@ -31,7 +32,6 @@ STEP = 1e-6  # of a prior's spread, or radians, cm or nats: few pieces come into
 CLEAR = 10.0  # nats; an error so much larger is no accident
 
 SPECIES = load_species()
-TURN, SHIFT, FACING, NOISE, THICKNESS = slice(-13, -10), slice(-10, -7), slice(-7, -5), slice(-5, -2), -3  # in theta
 N = len(SPECIES.space)
 NEUTRAL = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0, 0.0, 1.0, 0.0]
 X = np.array([3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, *NEUTRAL])
@@ -117,20 +117,29 @@ def rigid(random, reach_cm=30.0):
 def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0, organ=-1, facing=(0.0, 0.0)):
     """The kernel's density, without derivatives."""
     stem, leaf = organs
-    n, m = len(points), len(leaf.frame)
-    log_p = np.empty(n)
+    none = np.zeros(0, int)
+    radius = 0.5 * (stem.half_width[1:] + stem.half_width[:-1])
+    around = 2.0 * np.pi * stem.segment_lengths @ radius
+    facing = np.array(facing, float)
+    unchanged = np.zeros((len(stem.frame), 9, 0)), np.zeros(0), np.zeros(2)
+    segments = stem.axis[:-1], stem.frame, stem.segment_lengths, radius
+    tube = Tube(none, *segments, float(around), facing, noise[0], *unchanged)
     area = leaf.segment_lengths @ (leaf.half_width[1:] + leaf.half_width[:-1])
-    log_density(
-        np.array(points, float), np.full(n, organ, np.int8), np.ones(n),
-        leaf.axis[:-1], leaf.frame, leaf.segment_lengths, leaf.half_width, area, np.zeros((m, 9, 0)),
+    sides = (Side(leaf.frame, 1.0, 1.0, np.zeros((len(leaf.frame), 9, 0))),)
+    strip = Strip(
+        none,
+        leaf.axis[:-1],
+        leaf.segment_lengths,
+        leaf.half_width,
+        sides,
+        area,
+        np.array(noise[1:], float),
         np.zeros(0),
-        stem.axis[:-1], stem.frame, stem.segment_lengths, 0.5 * (stem.half_width[1:] + stem.half_width[:-1]),
-        2.0 * np.pi * stem.segment_lengths @ (0.5 * (stem.half_width[1:] + stem.half_width[:-1])),
-        np.zeros((len(stem.frame), 9, 0)), np.zeros(0),
-        np.array(facing, float), np.array(noise, float), np.array(share, float), float(outlier_density),
-        log_p, np.empty((0, 7)),
-    )  # fmt: skip
-    return np.exp(log_p)
+    )
+    mixture = Mixture((tube, strip), np.array(share, float), np.full(3, -1), np.full(len(points), outlier_density))
+    weights = [np.full(len(points), float(organ != other)) for other in (1, 0)]
+    with np.errstate(divide="ignore", invalid="ignore"):  # where there is nothing, not even an outlier
+        return np.exp(mixture.evaluate(np.array(points, float), weights, 0, derivatives=False).log_p)
 
 
 def gauss(low, high, noise):
@@ -314,15 +323,13 @@ def scene(x, seed, *, n=150, noise_cm=0.4, thick=True, cut=False, one_sided=True
     stray = n // 10
     points[:stray] = random.uniform(points.min(axis=0), points.max(axis=0), (stray, 3))
     organ[:stray] = -1
-    likelihood = CloudLikelihood(
-        species.model, species.space, points, organ=organ, thick=thick, cut=cut, executor=executor
-    )
-    likelihood = likelihood.one_sided() if one_sided else likelihood
+    likelihood = Posterior.of(species, points, organ=organ, thick=thick, cut=cut, executor=executor)
+    likelihood = likelihood.under(likelihood.prior.one_sided()) if one_sided else likelihood
     return likelihood, likelihood.start(x, pose, noise_cm)
 
 
 def at(state, theta, pose=None):
-    return State(theta, state.pose if pose is None else pose, state.center)
+    return State(theta, state.layout, state.pose if pose is None else pose, state.center)
 
 
 def disturbed(likelihood, state, random, turn=0.5):
@@ -331,12 +338,13 @@ def disturbed(likelihood, state, random, turn=0.5):
     theta = state.theta.copy()
     theta[:k] += 0.05 * likelihood.space.std * random.uniform(-1.0, 1.0, k)
     theta[k] = random.uniform(0.7, 0.99)
-    theta[TURN] = turn * np.array([2.0, -1.0, 2.0]) / 3.0
-    theta[SHIFT] = random.uniform(-3.0, 3.0, 3)
-    theta[FACING] = random.uniform(-2.0, 2.0, 2)
+    layout = state.layout
+    theta[layout["turn"]] = turn * np.array([2.0, -1.0, 2.0]) / 3.0
+    theta[layout["shift"]] = random.uniform(-3.0, 3.0, 3)
+    theta[layout["stem_facing"]] = random.uniform(-2.0, 2.0, 2)
     theta[-5:] += random.uniform(-0.5, 0.5, 5)
-    fixed = likelihood.lower == likelihood.upper
-    theta[fixed] = likelihood.mean[fixed]
+    fixed = likelihood.prior.lower == likelihood.prior.upper
+    theta[fixed] = likelihood.prior.mean[fixed]
     # the pose makes up for turn and shift but for some mm, so that the organs are still where the points are
     turned = likelihood.pose_of(at(state, theta, np.eye(4)))
     pose = np.linalg.solve(turned, state.pose)
@@ -348,7 +356,7 @@ def differences(likelihood, state, scores):
     """Differences of the points' log densities (n, k) by all k entries of theta: to that side on which they are nearer
     to the scores, since a piece that comes into reach makes a small jump on one side."""
     here = likelihood.evaluate(state, derivatives=False).log_p
-    steps = STEP * np.where(np.isfinite(likelihood.std), likelihood.std, 1.0)
+    steps = STEP * np.where(np.isfinite(likelihood.prior.std), likelihood.prior.std, 1.0)
     slopes = np.empty_like(scores)
     for i, step in enumerate(steps):
         theta = np.repeat(state.theta[np.newaxis], 2, axis=0)
@@ -364,7 +372,9 @@ def assert_scores_are_slopes(likelihood, state):
     scores = likelihood.evaluate(state).scores
     slopes = differences(likelihood, state, scores)
     assert scores.shape == (len(likelihood.points), len(state.theta))
-    size = np.where(likelihood.lower < likelihood.upper, np.abs(scores).max(axis=0), np.inf)  # what is fixed may be
+    size = np.where(
+        likelihood.prior.lower < likelihood.prior.upper, np.abs(scores).max(axis=0), np.inf
+    )  # what is fixed may be
     size = np.where(size > 1e-4, size, 1.0)  # of a parameter that no point knows of, or next to nothing
     np.testing.assert_allclose(scores / size, slopes / size, rtol=0, atol=SLOPE)  # at a kink: all of a leaf is seen
     np.testing.assert_allclose(scores.sum(axis=0) / size, slopes.sum(axis=0) / size, rtol=1e-3, atol=SUMMED)
@@ -379,7 +389,7 @@ def test_scores_are_the_slopes_of_the_log_density(k, thick, x, seed):
     likelihood, state = scene(x[:k], seed, thick=thick)
     scores = assert_scores_are_slopes(likelihood, disturbed(likelihood, state, np.random.default_rng(seed)))
     if not thick:
-        np.testing.assert_allclose(scores[:, THICKNESS], 0.0, atol=EXACT)
+        np.testing.assert_allclose(scores[:, state.layout["leaf_thickness"]], 0.0, atol=EXACT)
 
 
 @settings(max_examples=15)
@@ -409,15 +419,16 @@ def test_the_error_is_that_of_the_points_and_of_the_prior():
     """A normal prior of the species', of noise within a factor of 3, of shares; no pose is likelier than another."""
     likelihood, state = scene(SHAPED, 6)
     theta = disturbed(likelihood, state, np.random.default_rng(6)).theta
-    theta[TURN] += 1.0
-    theta[SHIFT] += 100.0
+    layout = state.layout
+    theta[layout["turn"]] += 1.0
+    theta[layout["shift"]] += 100.0
     here = likelihood.evaluate(at(state, theta))
     distance = np.concatenate(
         [
             (theta[:N] - SPECIES.space.mean) / SPECIES.space.std,
-            theta[FACING],
-            (theta[NOISE] - np.log(0.3)) / np.log(3.0),
-            (theta[-2:] - likelihood.mean[-2:]) / 2.5,
+            theta[layout["stem_facing"]],
+            (theta[layout.mask("stem_noise", "leaf_noise", "leaf_thickness")] - np.log(0.3)) / np.log(3.0),
+            (theta[-2:] - likelihood.prior.mean[-2:]) / 2.5,
         ]
     )
     assert here.error == pytest.approx(0.5 * np.sum(distance**2) - here.log_p.sum(), rel=EXACT)
@@ -430,7 +441,7 @@ def test_a_state_names_what_it_holds():
     theta[N:-5] = [0.8, 0.1, 0.2, 0.3, 4.0, 5.0, 6.0, -1.0, 2.0]
     theta[-5:] = np.log([0.2, 0.4, 0.1, 2.0, 0.5])
     named = at(state, theta)
-    assert (named.n_parameters, named.seen) == (N, 0.8)
+    assert (len(named.x), named.seen) == (N, 0.8)
     np.testing.assert_array_equal(named.x, SHAPED)
     np.testing.assert_array_equal(named.turn, [0.1, 0.2, 0.3])
     np.testing.assert_array_equal(named.shift, [4.0, 5.0, 6.0])
@@ -478,7 +489,7 @@ def test_what_was_not_seen_takes_no_part_of_the_leaf():
     organ = np.ones(60, np.int8)
 
     def of_leaf(hidden):
-        likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, whole.points, organ=organ, thick=True, hidden=hidden)
+        likelihood = Posterior.of(SPECIES, whole.points, organ=organ, thick=True, hidden=hidden)
         return np.exp(likelihood.evaluate(state, derivatives=False).log_p) - likelihood.outlier_density * state.share[2]
 
     area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
@@ -487,7 +498,7 @@ def test_what_was_not_seen_takes_no_part_of_the_leaf():
     expected = of_leaf(None) * (1.0 - hidden.at(whole.points)) / (1.0 - gone)
     np.testing.assert_allclose(of_leaf(hidden), expected, rtol=2e-3, atol=1e-15)
     hidden = Hidden(leaf, np.random.default_rng(9).uniform(0.0, 0.98, (30, 9)))
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, whole.points, thick=True, hidden=hidden)
+    likelihood = Posterior.of(SPECIES, whole.points, thick=True, hidden=hidden)
     assert_scores_are_slopes(likelihood, disturbed(likelihood, state, np.random.default_rng(8)))
 
 
@@ -497,7 +508,8 @@ def test_scores_are_slopes_beside_a_void(facing):
     leaf = move(grow(state.x), whole.pose_of(state))[1]
     void = Void(leaf.axis[0] + np.array([0.3, -0.2, 0.5]), 2.0, 0.6)
     hidden = Hidden(leaf, np.zeros((30, 9)), void)
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, whole.points, thick=True, hidden=hidden).one_sided()
+    likelihood = Posterior.of(SPECIES, whole.points, thick=True, hidden=hidden)
+    likelihood = likelihood.under(likelihood.prior.one_sided())
     state = disturbed(likelihood, state, np.random.default_rng(8))
     theta = state.theta.copy()
     theta[-7:-5] = facing
@@ -509,7 +521,7 @@ def test_a_part_of_a_piece_may_be_missing(clean):
     whole, state = clean
     base = state.pose[:3, :3].T @ (whole.points - state.pose[:3, 3]).T
     far = np.linalg.norm(base.T - [0.0, 0.0, X[1]], axis=1)
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, whole.points[far < 0.7 * far.max()], cut=True)
+    likelihood = Posterior.of(SPECIES, whole.points[far < 0.7 * far.max()], cut=True)
     seen = np.linspace(0.5, 1.0, 101)
     errors = []
     for share in seen:
@@ -536,7 +548,7 @@ def test_a_cloud_may_lie_anywhere():
     likelihood, state = scene(SHAPED, 8)
     there = rigid(np.random.default_rng(8))
     moved = likelihood.at(likelihood.points @ there[:3, :3].T + there[:3, 3])
-    state_there = State(state.theta, there @ state.pose, there[:3, :3] @ state.center + there[:3, 3])
+    state_there = State(state.theta, state.layout, there @ state.pose, there[:3, :3] @ state.center + there[:3, 3])
     np.testing.assert_allclose(moved.evaluate(state_there).log_p, likelihood.evaluate(state).log_p, rtol=1e-8)
 
 
@@ -545,9 +557,7 @@ def test_the_pose_turns_about_the_junction_and_shifts():
     junction = np.array([0.0, 0.0, X[1]])
     np.testing.assert_allclose(state.center, state.pose[:3, :3] @ junction + state.pose[:3, 3], rtol=EXACT)
     np.testing.assert_allclose(likelihood.pose_of(state), state.pose, atol=1e-12)
-    theta = state.theta.copy()
-    theta[TURN], theta[SHIFT] = [0.3, -0.8, 0.4], [1.0, -2.0, 3.0]
-    pose = likelihood.pose_of(at(state, theta))
+    pose = likelihood.pose_of(state.changed(turn=[0.3, -0.8, 0.4], shift=[1.0, -2.0, 3.0]))
     moved = pose[:3, :3] @ junction + pose[:3, 3] - state.center
     np.testing.assert_allclose(moved, [1.0, -2.0, 3.0], rtol=1e-9)
     turn = pose[:3, :3] @ state.pose[:3, :3].T
@@ -560,7 +570,7 @@ def test_an_outlier_has_the_density_of_the_clouds_hull():
     points = random.uniform([0, 0, 0], [30, 20, 10], (50, 3)) + 500.0
     points[:8] = [[x, y, z] for x in (500, 530) for y in (500, 520) for z in (500, 510)]  # its hull is the box
     for cloud, volume in ((points, 30 * 20 * 10), (points * [1, 1, 0], 30 * 20 * 1.5)):
-        likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, cloud)
+        likelihood = Posterior.of(SPECIES, cloud)
         state = likelihood.start(X, np.eye(4), 0.3)
         state.theta[-2:] = [0.0, np.log(2.0)]  # shares of stem, leaf and outliers as 1 : 1 : 2
         found = likelihood.evaluate(state, derivatives=False).log_p
@@ -574,7 +584,7 @@ def clean():
     pose = rigid(np.random.default_rng(11))
     points, _ = SurfaceSampler(800, 11).draw(move(grow(X), pose))
     points += np.random.default_rng(12).normal(0.0, 0.3, points.shape)
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    likelihood = Posterior.of(SPECIES, points)
     return likelihood, likelihood.start(X, pose, 0.3)
 
 
@@ -613,15 +623,16 @@ def test_threads_and_blocks_change_no_bit(monkeypatch):
         assert other.error == alone.error
         assert other.log_p.tobytes() == alone.log_p.tobytes()
         assert other.scores.tobytes() == alone.scores.tobytes()
+        assert other.responsibilities.tobytes() == alone.responsibilities.tobytes()
 
 
 @pytest.mark.parametrize("thick", [True, False])
 def test_an_extended_state_has_the_same_organs(thick):
     plain, state = scene(X[:7], 14, thick=False)
     state = disturbed(plain, state, np.random.default_rng(14))
-    rich = CloudLikelihood(SPECIES.model, SPECIES.space, plain.points, organ=plain.organ, thick=thick)
+    rich = Posterior.of(SPECIES, plain.points, organ=plain.organ, thick=thick)
     extended = rich.extended(state)
-    assert (extended.n_parameters, extended.theta.shape) == (N, rich.mean.shape)
+    assert (len(extended.x), extended.theta.shape) == (N, rich.prior.mean.shape)
     (stem, few), (pieces, many) = grow(state.x), grow(extended.x)
     for name in ("axis", "frame", "half_width"):
         np.testing.assert_allclose(getattr(many, name), getattr(few, name), atol=1e-12)
@@ -631,7 +642,7 @@ def test_an_extended_state_has_the_same_organs(thick):
     assert extended.seen == state.seen
     np.testing.assert_array_equal(extended.noise[:2], state.noise[:2])
     np.testing.assert_array_equal(extended.share, state.share)
-    assert extended.theta[THICKNESS] == rich.mean[THICKNESS]
+    assert extended["leaf_thickness"] == rich.prior.mean[rich.prior.layout.place("leaf_thickness")]
     if not thick:
         np.testing.assert_allclose(rich.evaluate(extended).log_p, plain.evaluate(state).log_p, rtol=BESSEL)
     assert rich.extended(extended).theta.tobytes() == extended.theta.tobytes()
@@ -642,10 +653,10 @@ def test_an_extended_state_has_the_same_organs(thick):
 def test_a_start_lies_within_the_bounds(thick, cut):
     """All of a leaf is seen, and it has no thickness unless it may."""
     likelihood, state = scene(SHAPED, 15, thick=thick, cut=cut, one_sided=False)
-    assert np.all((state.theta >= likelihood.lower) & (state.theta <= likelihood.upper))
+    assert np.all((state.theta >= likelihood.prior.lower) & (state.theta <= likelihood.prior.upper))
     np.testing.assert_array_equal(state.x, SHAPED)
     np.testing.assert_allclose(state.noise[:2], 0.4, rtol=EXACT)
     assert state.seen == 1.0
-    fixed = np.flatnonzero(likelihood.lower == likelihood.upper)
+    fixed = np.flatnonzero(likelihood.prior.lower == likelihood.prior.upper)
     assert set(fixed) == ({N} if not cut else set()) | ({N + 11} if not thick else set()) | {N + 7, N + 8}
     assert (state.noise[2] > 0.01) == thick

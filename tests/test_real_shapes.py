@@ -10,7 +10,8 @@ import phytofit.models
 import phytofit.simulation
 from phytofit.engine import search as posterior
 from phytofit.engine.dependence import Bell, Dependence
-from phytofit.engine.refine import Cloud, refined_end
+from phytofit.engine.posterior import Posterior
+from phytofit.engine.refine import Cloud, Optimum, optimum_near
 from phytofit.engine.restarts import along_points, longer_leaf, longer_stem, lower_insertion, turned_blade
 from phytofit.models.organs import frames_along
 
@@ -33,6 +34,11 @@ def trait(result, name):
     return next(t for t in result.traits if t.name == name)
 
 
+def standing(posterior, state):
+    """An optimum as a restart takes it, wherever it stands."""
+    return Optimum(posterior, state, posterior.evaluate(state), converged=False)
+
+
 def assert_held(made, result, *names):
     true = {t.name: t.value for t in phytofit.measure(made.organs)}
     for name in names:
@@ -52,11 +58,10 @@ def test_the_start_with_a_turned_blade_is_turned_as_the_points_lie():
     made = grown(leaf_roll=60.0, leaf_twist=30.0)
     plain = SPECIES.leading(7)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
-    start = phytofit.engine.likelihood.CloudLikelihood(plain.model, plain.space, points).start(
-        made.x[:7], np.eye(4), 1.0
-    )
-    end = refined_end(plain, start, Cloud(points, None, None))
-    (turned,) = turned_blade(SPECIES, end.likelihood, end.state, end.at.scores)
+    start = Posterior.of(plain, points).start(made.x[:7], np.eye(4), 1.0)
+    end = optimum_near(plain, start, Cloud(points, None, None))
+    rich = Posterior.of(SPECIES, points, thick=True)
+    (turned,) = turned_blade(standing(rich, rich.extended(end.state)))
     assert turned.x[NAMES.index("leaf_roll")] == pytest.approx(60.0, abs=15.0)
     assert turned.x[NAMES.index("leaf_twist")] == pytest.approx(30.0, abs=25.0)
 
@@ -65,13 +70,13 @@ def test_the_start_with_a_turned_blade_is_turned_as_the_points_lie():
 def test_a_blade_on_edge_is_begun_turned_back(roll):
     """A rich leaf that has taken the blade's width for its thickness: where it ends is a hill of its own."""
     made = grown(leaf_roll=roll, leaf_twist=20.0, leaf_bow=25.0, leaf_side_bend=20.0)
-    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points, thick=True)
+    likelihood = Posterior.of(SPECIES, made.points, thick=True)
     x = made.x.copy()
     x[NAMES.index("leaf_roll")] += 90.0
     x[NAMES.index("leaf_width")] = 2.0
     state = likelihood.start(x, made.pose, 0.3)
-    state.theta[-3] = np.log(6.0 / np.sqrt(12.0))
-    (turned,) = turned_blade(SPECIES, likelihood, state, likelihood.evaluate(state).scores)
+    state = state.changed(leaf_thickness=np.log(6.0 / np.sqrt(12.0)))
+    (turned,) = turned_blade(standing(likelihood, state))
     assert turned.x[NAMES.index("leaf_roll")] == pytest.approx(roll, abs=10.0)
     assert turned.x[NAMES.index("leaf_twist")] == pytest.approx(20.0, abs=15.0)
     assert turned.x[NAMES.index("leaf_width")] == pytest.approx(6.0, rel=0.15)
@@ -81,11 +86,10 @@ def test_a_level_blade_is_not_begun_turned():
     made = grown()
     plain = SPECIES.leading(7)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
-    start = phytofit.engine.likelihood.CloudLikelihood(plain.model, plain.space, points).start(
-        made.x[:7], np.eye(4), 1.0
-    )
-    end = refined_end(plain, start, Cloud(points, None, None))
-    assert list(turned_blade(SPECIES, end.likelihood, end.state, end.at.scores)) == []
+    start = Posterior.of(plain, points).start(made.x[:7], np.eye(4), 1.0)
+    end = optimum_near(plain, start, Cloud(points, None, None))
+    rich = Posterior.of(SPECIES, points, thick=True)
+    assert list(turned_blade(standing(rich, rich.extended(end.state)))) == []
 
 
 def test_a_sheath_that_ends_at_the_collar():
@@ -100,8 +104,8 @@ def test_a_sheath_that_ends_at_the_collar():
 
 def test_the_start_with_a_lower_insertion_moves_only_the_leafs_base():
     made = grown()
-    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
-    (lower,) = lower_insertion(SPECIES, likelihood.start(made.x, np.eye(4), 0.3))
+    likelihood = Posterior.of(SPECIES, made.points)
+    (lower,) = lower_insertion(standing(likelihood, likelihood.start(made.x, np.eye(4), 0.3)))
     assert lower.x[1] == pytest.approx(made.x[1] - 0.12 * made.x[3])
     assert lower.x[1] + lower.x[6] == pytest.approx(made.x[1] + made.x[6])
     before, after = (SPECIES.model.organs(x)[1].axis[0] for x in (made.x, lower.x))
@@ -186,26 +190,26 @@ def test_a_leaf_that_curls_back_is_begun_along_its_points():
     """From a state whose leaf stops where the real one turns away, the midrib is laid along the rest of it."""
     made = grown(leaf_length=70.0, leaf_rotate_angle=5.5, leaf_bow=0.0, n_points=4000)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
-    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    likelihood = Posterior.of(SPECIES, points)
     x = made.x.copy()
     x[[3, 5]] = 45.0, 1.0
     state = likelihood.start(x, np.eye(4), 0.5)
-    (along,) = along_points(SPECIES, likelihood, state, likelihood.evaluate(state).scores)
+    (along,) = along_points(standing(likelihood, state))
     assert along.x[3] == pytest.approx(70.0, abs=4.0)
     there, true = (SPECIES.model.organs(it)[1].axis[0] for it in (along.x, made.x))
     assert np.linalg.norm(there[5:] - true[5:], axis=1).max() < 4.0
     assert np.linalg.norm(SPECIES.model.organs(x)[1].axis[0, -1] - true[-1]) > 20.0
     state = likelihood.start(made.x, np.eye(4), 0.5)
-    assert list(along_points(SPECIES, likelihood, state, likelihood.evaluate(state).scores)) == []
+    assert list(along_points(standing(likelihood, state))) == []
 
 
 def test_a_leaf_in_pieces_has_no_line():
     made = grown(leaf_length=70.0)
     points = (made.points - made.pose[:3, 3]) @ made.pose[:3, :3]
     scarce = np.concatenate([points[made.labels == 1], points[made.labels == 2][:15]])
-    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, scarce)
+    likelihood = Posterior.of(SPECIES, scarce)
     state = likelihood.start(made.x, np.eye(4), 0.5)
-    assert list(along_points(SPECIES, likelihood, state, likelihood.evaluate(state).scores)) == []
+    assert list(along_points(standing(likelihood, state))) == []
 
 
 def test_points_beyond_the_tip_are_flagged_and_open_the_length():
@@ -310,13 +314,11 @@ def test_a_leaf_of_many_points_is_not_called_sparse():
 
 def test_a_longer_leaf_is_begun_only_where_points_are_left_over():
     made = grown(**OWN)
-    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, made.points)
+    likelihood = Posterior.of(SPECIES, made.points)
     state = likelihood.start(made.x, made.pose, 0.3)
-    longer = list(longer_leaf(state))
+    longer = list(longer_leaf(standing(likelihood, state)))
     assert [it.x[3] / state.x[3] for it in longer] == pytest.approx([1.12, 1.3])
-    theta = state.theta.copy()
-    theta[-1] = -9.0
-    assert list(longer_leaf(likelihood.with_theta(state, theta))) == []
+    assert list(longer_leaf(standing(likelihood, state.changed(outlier_share=-9.0)))) == []
 
 
 @pytest.mark.parametrize("seed", [5000, *(pytest.param(seed, marks=pytest.mark.long) for seed in (5007, 5021))])
@@ -362,7 +364,7 @@ def test_a_longer_stem_is_begun_beyond_a_gap(lost):
     height = ((made.points - made.pose[:3, 3]) @ made.pose[:3, :3])[:, 2]
     gap = (height > 18.0) & (height < 22.0) if lost == "above" else (height > 5.0) & (height < 9.0)
     points = made.points[~gap | (made.labels == 2)]
-    likelihood = phytofit.engine.likelihood.CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    likelihood = Posterior.of(SPECIES, points)
     x = made.x.copy()
     if lost == "above":
         x[6] = 3.0
@@ -371,17 +373,13 @@ def test_a_longer_stem_is_begun_beyond_a_gap(lost):
     pose = made.pose.copy()
     pose[:3, 3] += (made.x[1] - x[1]) * pose[:3, 2] + 0.3
     state = likelihood.start(x, pose, 0.3)
-    theta = state.theta.copy()
-    theta[-13:-10] = 0.02 * pose[:3, 2]  # about the stem, which it leaves where it is
-    theta[-10:-7] = -0.3
-    theta[-1] = -2.0
-    state = likelihood.with_theta(state, theta)
-    scores = likelihood.evaluate(state).scores
-    (longer,) = longer_stem(likelihood, state, scores)
+    turn = 0.02 * pose[:3, 2]  # about the stem, which it leaves where it is
+    state = state.changed(turn=turn, shift=-0.3, outlier_share=-2.0)
+    (longer,) = longer_stem(standing(likelihood, state))
     np.testing.assert_allclose(stem_of(made, longer, likelihood), [0.0, 30.0], atol=1.0)
     assert longer.x[3] == x[3]
-    end = refined_end(SPECIES, longer, Cloud(points, None, None))
-    assert list(longer_stem(end.likelihood, end.state, end.at.scores)) == []
+    end = optimum_near(SPECIES, longer, Cloud(points, None, None))
+    assert list(longer_stem(end)) == []
 
 
 def wavy(seed=1, n_points=4000, radius=1.2, noise_cm=0.25, along_deg=8.0, ragged=0.0):
@@ -409,7 +407,7 @@ def wavy_ends():
     points, _ = wavy()
     plain = SPECIES.leading(7)
     upright = np.array([1.2, 15.0, 30.0, 60.0, 5.0, 3.0, 10.0])
-    start = phytofit.engine.likelihood.CloudLikelihood(plain.model, plain.space, points).start(upright, np.eye(4), 2.0)
+    start = Posterior.of(plain, points).start(upright, np.eye(4), 2.0)
     return points, posterior._candidates(plain, SPECIES, Cloud(points, None, None), start)
 
 
@@ -419,7 +417,7 @@ def test_misfit_does_not_speak_for_the_poorer_model(on_stem, monkeypatch, wavy_e
     that fits a little better is not believed.  Where the stem's are not, the leaf's are misfit, of which the richer
     leaf has less."""
     points, ends = wavy_ends
-    gain = ends[2].fit_of_points - ends[0].fit_of_points
+    gain = ends[2].log_likelihood - ends[0].log_likelihood
     assert gain > 300.0
 
     def inflated(likelihood, state, known=None):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import phytofit
-from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.sighting import sighting
 from phytofit.engine.tip import gain_of_blunt_end
 
@@ -22,17 +22,17 @@ def scene(seed, *, until=1.0, longer=1.0, noise_cm=0.3, **shape):
     leaf = made.organs[1]
     piece, _ = leaf.nearest(made.points)
     points = made.points[(made.labels == 1) | (piece < until * len(leaf.segment_lengths))]
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    likelihood = Posterior.of(SPECIES, points)
     x = made.x.copy()
     x[[3, 5]] *= longer  # the bend is a thirtieth of the leaf's
     state = likelihood.start(x, made.pose, noise_cm)
     theta = state.theta.copy()
     theta[-2:] = np.log(float(made.organs[0].area) / float(leaf.area)), -6.0
-    return likelihood, likelihood.with_theta(state, theta)
+    return likelihood, state.at(theta)
 
 
 def gain(likelihood, state):
-    return gain_of_blunt_end(likelihood, state, likelihood.evaluate(state).scores)
+    return gain_of_blunt_end(likelihood, state, likelihood.evaluate(state))
 
 
 def test_a_leaf_that_ends_in_a_point_does_not_end_bluntly():
@@ -78,18 +78,18 @@ def test_a_missing_tip_is_noticed_by_few_points(seed):
 def test_points_that_would_be_expected_beyond_the_last():
     """As many as the area there has, of all that are the leaf's."""
     likelihood, state = scene(2, longer=1.2, noise_cm=0.1, leaf_rotate_angle=0.0)
-    seen = sighting(likelihood, state, likelihood.evaluate(state).scores)
+    seen = sighting(likelihood, state, likelihood.evaluate(state))
     leaf = likelihood.model.organs(state.x)[1].row(0)
     area = leaf.segment_lengths * (leaf.half_width[1:] + leaf.half_width[:-1])
     beyond = float(area[25:].sum() / area.sum())  # the last of thirty pieces, from 1 / 1.2 on
-    n = np.count_nonzero(1.0 - likelihood.evaluate(state).scores[:, -2] - state.share[0] > 0.5)
+    n = np.count_nonzero(1.0 - likelihood.evaluate(state).responsibilities[:, 0] > 0.5)
     assert seen.end == pytest.approx(1.0 / 1.2, abs=0.02)
     assert seen.short == pytest.approx(n * beyond, rel=0.25)  # the last point lies a little before the end
 
 
 def test_no_more_points_are_expected_beyond_the_end_of_a_whole_leaf():
     likelihood, state = scene(2, noise_cm=0.1)
-    seen = sighting(likelihood, state, likelihood.evaluate(state).scores)
+    seen = sighting(likelihood, state, likelihood.evaluate(state))
     assert seen.end > 0.97
     assert seen.short < CLEAR
 

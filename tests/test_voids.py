@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import phytofit
 from phytofit.engine.holes import find_holes
-from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.visibility import Hidden
 from phytofit.engine.voids import Void, around_stem
 from phytofit.models import Phytomer
@@ -33,10 +33,10 @@ def around_base(true, seed):
 
 
 def void_in(true, points):
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    likelihood = Posterior.of(SPECIES, points)
     state = likelihood.start(true.x[:7], true.pose, NOISE_CM)
     state.theta[-2] = np.log(0.4)
-    hidden = find_holes(likelihood, state, likelihood.evaluate(state).scores, with_void=True)
+    hidden = find_holes(likelihood, state, likelihood.evaluate(state), with_void=True)
     return None if hidden is None else hidden.void
 
 
@@ -121,7 +121,7 @@ def test_what_is_left_is_denser_by_what_the_void_takes_of_each_organ():
         density = []
         for hidden in (None, Hidden(leaf, np.zeros((30, 9)), void)):
             labels = np.full(len(points), organ, np.int8)
-            likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points, organ=labels, hidden=hidden)
+            likelihood = Posterior.of(SPECIES, points, organ=labels, hidden=hidden)
             state = likelihood.start(x, true.pose, NOISE_CM)
             at = likelihood.evaluate(state, derivatives=False)
             density.append(np.exp(at.log_p) - likelihood.outlier_density * state.share[2])

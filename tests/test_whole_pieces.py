@@ -9,7 +9,7 @@ from scipy.stats import ttest_1samp
 import phytofit
 from phytofit.engine import outcome
 from phytofit.engine.covariance import grown
-from phytofit.engine.likelihood import CloudLikelihood
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.refine import refinement
 from phytofit.engine.visibility import N_STRIPS, Hidden
 from phytofit.engine.whole_pieces import WIDTHS, of_whole_pieces
@@ -43,7 +43,7 @@ def at_the_truth(true, points, rows):
     """The likelihood, with holes in these pieces (m,) of the leaf, and the true state."""
     share = np.zeros((len(rows), N_STRIPS))
     share[rows, 2:7] = 0.8
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points, hidden=Hidden(true.organs[1], share))
+    likelihood = Posterior.of(SPECIES, points, hidden=Hidden(true.organs[1], share))
     return likelihood, likelihood.start(true.x[:7], true.pose, NOISE_CM)
 
 
@@ -53,7 +53,7 @@ def width_of(result):
 
 def test_a_leaf_without_holes_has_nothing_to_tell_anew():
     true, points = made(1)
-    likelihood = CloudLikelihood(SPECIES.model, SPECIES.space, points)
+    likelihood = Posterior.of(SPECIES, points)
     assert of_whole_pieces(likelihood, likelihood.start(true.x[:7], true.pose, NOISE_CM)) is None
 
 

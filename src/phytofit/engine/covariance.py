@@ -6,7 +6,9 @@ from scipy.linalg import LinAlgError, cho_factor, pinvh
 
 from phytofit.engine.dependence import Bell, Dependence
 from phytofit.engine.intervals import covariance_of_independent
-from phytofit.engine.likelihood import CloudLikelihood, Evaluation, State
+from phytofit.engine.layout import State
+from phytofit.engine.mixture import Evaluation
+from phytofit.engine.posterior import Posterior
 
 __all__ = ["covariance_of", "grown", "misfit_of", "mixed", "of_sensor", "shared_by_neighbors"]
 
@@ -17,7 +19,7 @@ STEP = 0.02  # of a parameter's standard error, for differences of the gradient
 
 
 def covariance_of(
-    likelihood: CloudLikelihood,
+    posterior: Posterior,
     state: State,
     at: Evaluation,
     dependence: Dependence,
@@ -29,9 +31,9 @@ def covariance_of(
     bound holds (a length or a share, not an angle, for which 0 is no end) has an error of its own, which the others do
     not follow.
     """
-    free = likelihood.free
-    curvature = _curvature(likelihood, state, at)
-    held = _held(likelihood, state, at)[free]
+    free = posterior.prior.free
+    curvature = _curvature(posterior, state, at)
+    held = _held(posterior, state, at)[free]
     curvature = np.where(held[:, np.newaxis] | held, np.diag(np.diag(curvature)), curvature)
     inverse = pinvh(curvature)
     left = max(
@@ -39,12 +41,12 @@ def covariance_of(
     )  # a fit takes some errors up
     scores = at.scores[:, free]
     shared = dependence.variability[np.ix_(free, free)] - scores.T @ scores  # by neighbours
-    pull = likelihood.pull[free]
-    shared += np.diag(pull * (likelihood.prior_weight[free] - 1.0))  # what a prior counts for again is no more news
+    pull = posterior.prior.curvature[free]
+    shared += np.diag(pull * (posterior.prior.weight[free] - 1.0))  # what a prior counts for again is no more news
     alone = covariance_of_independent(curvature, scores, pull)
     covariance = np.zeros((len(free), len(free)))
     covariance[np.ix_(free, free)] = (alone + inverse @ shared @ inverse) * dependence.n_independent / left
-    covariance[np.ix_(free, free)] += _by_holes(likelihood, state, at, inverse)
+    covariance[np.ix_(free, free)] += _by_holes(posterior, state, at, inverse)
     return covariance, float(left)
 
 
@@ -84,46 +86,46 @@ def shared_by_neighbors(dependence: Dependence, noise: FloatArray) -> float:
     return float(np.sqrt(dependence.leaf.correlation * float(noise[1] ** 2 + noise[2] ** 2)))
 
 
-def _held(likelihood: CloudLikelihood, state: State, at: Evaluation) -> NDArray[np.bool_]:
+def _held(posterior: Posterior, state: State, at: Evaluation) -> NDArray[np.bool_]:
     """Which entries of theta would be beyond their bounds, were there none; of the model's parameters but angles, and
     but those that a weighted prior takes there, not the points."""
-    gradient = likelihood.gradient(state, at)
-    held = np.where(gradient > 0.0, state.theta <= likelihood.lower, state.theta >= likelihood.upper)
-    held[: state.n_parameters] &= np.array(likelihood.space.units) != "deg"
-    held &= likelihood.prior_weight == 1.0
+    gradient = posterior.gradient(state, at)
+    held = np.where(gradient > 0.0, state.theta <= posterior.prior.lower, state.theta >= posterior.prior.upper)
+    held[state.layout.model] &= np.array(posterior.space.units) != "deg"
+    held &= posterior.prior.weight == 1.0
     return held
 
 
-def _by_holes(likelihood: CloudLikelihood, state: State, at: Evaluation, inverse: FloatArray) -> FloatArray:
+def _by_holes(posterior: Posterior, state: State, at: Evaluation, inverse: FloatArray) -> FloatArray:
     """Covariance (m, m) of the free entries of theta, of which `inverse` is that of the curvature, as it is not known
     where holes end: to a cell either way; 0 where there are none, or where points were left out on purpose."""
-    if likelihood.hidden is None or likelihood.is_part:
+    if posterior.hidden is None or posterior.is_part:
         return np.zeros_like(inverse)
-    before = likelihood.gradient(state, at)[likelihood.free]
+    before = posterior.gradient(state, at)[posterior.prior.free]
     shifts = []
-    for other in (likelihood.hidden.smaller(), likelihood.hidden.larger()):
-        there = likelihood.hiding(other)
-        shifts.append(inverse @ (there.gradient(state, there.evaluate(state))[likelihood.free] - before))
+    for other in (posterior.hidden.smaller(), posterior.hidden.larger()):
+        there = posterior.hiding(other)
+        shifts.append(inverse @ (there.gradient(state, there.evaluate(state))[posterior.prior.free] - before))
     both = np.array(shifts)
     covariance: FloatArray = 0.5 * both.T @ both
     return covariance
 
 
-def _curvature(likelihood: CloudLikelihood, state: State, at: Evaluation) -> FloatArray:
+def _curvature(posterior: Posterior, state: State, at: Evaluation) -> FloatArray:
     """Second derivatives of the error by the free entries of theta, by differences of the gradient, 0 for those of
     which nothing is known; the information where they are not positive definite."""
-    free = np.flatnonzero(likelihood.free)
-    gradient = likelihood.gradient(state, at)[free]
-    information = (at.scores.T @ at.scores + np.diag(likelihood.pull))[np.ix_(free, free)]
+    free = np.flatnonzero(posterior.prior.free)
+    gradient = posterior.gradient(state, at)[free]
+    information = (at.scores.T @ at.scores + np.diag(posterior.prior.curvature))[np.ix_(free, free)]
     curvature = np.zeros_like(information)
     for row, i in enumerate(free):
         if information[row, row] < LEAST_KNOWN:
             continue
         step = STEP / np.sqrt(information[row, row])
         theta = state.theta.copy()
-        theta[i] += step if theta[i] + step <= likelihood.upper[i] else -step
-        moved = likelihood.with_theta(state, theta)
-        change = likelihood.gradient(moved, likelihood.evaluate(moved))[free] - gradient
+        theta[i] += step if theta[i] + step <= posterior.prior.upper[i] else -step
+        moved = state.at(theta)
+        change = posterior.gradient(moved, posterior.evaluate(moved))[free] - gradient
         curvature[row] = change / (theta[i] - state.theta[i])
     curvature = 0.5 * (curvature + curvature.T)
     try:

@@ -10,7 +10,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array
 from scipy.spatial import cKDTree
 
-from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.layout import State
+from phytofit.engine.mixture import Evaluation
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.sighting import across_leaf
 from phytofit.kernels.neighbors import sum_by_distance
 from phytofit.models import Organ, move
@@ -57,7 +59,7 @@ class Dependence:
     leaf: Bell
 
 
-def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependence | None = None) -> Dependence:
+def score_dependence(posterior: Posterior, state: State, known: Dependence | None = None) -> Dependence:
     """Covariance of the sum of scores of points whose errors are correlated with their neighbours'.
 
     How far they are correlated is taken from what is `known` of another model of the same cloud, if it is given.
@@ -68,12 +70,13 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
     the errors counts, the scores' change when a point is moved.  Misfit of the model is correlated as well, and counts;
     where it is far less on one of stem and leaf, the bell is lower there.
     """
-    scores = likelihood.evaluate(state).scores
+    at = posterior.evaluate(state)
+    scores = at.scores
     independent = scores.T @ scores
-    on_stem, _, outlier = state.belongs(scores)
+    on_stem, _, outlier = at.responsibilities.T
     noise = state.noise
-    organs = move([o.row(0) for o in likelihood.model.organs(state.x)], likelihood.pose_of(state))
-    frame, distance = _local(organs, likelihood.points, on_stem > 0.5)
+    organs = move([o.row(0) for o in posterior.model.organs(state.x)], posterior.pose_of(state))
+    frame, distance = _local(organs, posterior.points, on_stem > 0.5)
     across = float(np.hypot(noise[1], noise[2]))
     std = np.where((on_stem > 0.5)[:, np.newaxis], noise[0], [noise[1], noise[1], across])  # tangent, lateral, normal
     errors = distance / std[:, 2]
@@ -83,7 +86,7 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
         one = sure & organ
         errors[one] -= errors[one].mean() if one.any() else 0.0  # noise moves points off a tube on average
     # places on the surface: points that are near each other in space have been moved alike, by selection
-    place = likelihood.points - distance[:, np.newaxis] * frame[:, :, 2]
+    place = posterior.points - distance[:, np.newaxis] * frame[:, :, 2]
     bells, both = [NONE, NONE], NONE
     if known is not None:
         bells = [known.stem, known.leaf]
@@ -92,9 +95,9 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
     if bells == [NONE, NONE]:
         return Dependence(independent, 1.0, float(len(scores)), NONE, NONE)
 
-    changes = [_change_of_scores(likelihood, state, frame[:, :, a], std[:, a]) for a in range(3)]
+    changes = [_change_of_scores(posterior, state, frame[:, :, a], std[:, a]) for a in range(3)]
     if known is None:
-        information = independent + np.diag(likelihood.precision + 1e-9)
+        information = independent + np.diag(posterior.prior.precision + 1e-9)
         whole = _before_the_fit(
             place[sure], errors[sure], [change[sure] for change in changes], information, both.reach_cm
         )
@@ -107,8 +110,8 @@ def score_dependence(likelihood: CloudLikelihood, state: State, known: Dependenc
         extra, pairs = _alike(place[organ], [change[organ] for change in changes], bell.reach_cm)
         variability += bell.correlation * extra
         alike += bell.correlation * pairs + (1.0 - bell.correlation) * np.count_nonzero(organ)
-    factor = cho_factor(independent + np.diag(likelihood.precision + 1e-9))
-    inflation = float(np.trace(cho_solve(factor, variability + np.diag(likelihood.precision)))) / len(independent)
+    factor = cho_factor(independent + np.diag(posterior.prior.precision + 1e-9))
+    inflation = float(np.trace(cho_solve(factor, variability + np.diag(posterior.prior.precision)))) / len(independent)
     return Dependence(variability, max(1.0, inflation), len(scores) ** 2 / alike, *bells)
 
 
@@ -132,28 +135,28 @@ def _alike(places: FloatArray, changes: Sequence[FloatArray], reach_cm: float) -
     return positive, float(count @ (weight @ count) * 2.0 + count @ count)
 
 
-def _change_of_scores(likelihood: CloudLikelihood, state: State, direction: FloatArray, std: FloatArray) -> FloatArray:
+def _change_of_scores(posterior: Posterior, state: State, direction: FloatArray, std: FloatArray) -> FloatArray:
     """Change (n, k) of each point's scores by one standard deviation `std` (n,) along its `direction` (n, 3)."""
     shift = (SHIFT * std)[:, np.newaxis] * direction
-    there, back = (likelihood.at(likelihood.points + sign * shift).evaluate(state).scores for sign in (1.0, -1.0))
+    there, back = (posterior.at(posterior.points + sign * shift).evaluate(state).scores for sign in (1.0, -1.0))
     return (there - back) / (2.0 * SHIFT)
 
 
-def width_misfit(likelihood: CloudLikelihood, state: State, scores: FloatArray, bell: Bell) -> float:
+def width_misfit(posterior: Posterior, state: State, at: Evaluation, bell: Bell) -> float:
     """Standard deviation of the leaf's width about the model's, place by place, as a share of it, beyond chance.
 
     Points that are uniform across a strip vary by a third of its half width squared, and by the noise, which neighbours
     share as the `bell` says.
     """
-    on_leaf = state.belongs(scores)[1] > 0.5
-    leaf = likelihood.model.organs(state.x)[1].row(0)
+    on_leaf = at.responsibilities[:, 1] > 0.5
+    leaf = posterior.model.organs(state.x)[1].row(0)
     lengths = leaf.segment_lengths
-    place, across = across_leaf(likelihood, state)
+    place, across = across_leaf(posterior, state)
     place, lateral = place[on_leaf], across[on_leaf, 0]
     half = np.interp(place * lengths.sum(), np.concatenate([[0.0], np.cumsum(lengths)]), leaf.half_width)
     ratio, chance = [], []
-    hidden = likelihood.hidden
-    whole = np.ones(likelihood.model.n_pieces, bool) if hidden is None else ~hidden.pieces
+    hidden = posterior.hidden
+    whole = np.ones(posterior.model.n_pieces, bool) if hidden is None else ~hidden.pieces
     for i in range(1, N_PIECES - 2):  # not where stem and tip are
         low, high = (int(np.floor(end * len(whole) / N_PIECES)) for end in (i, i + 1))
         those = (place * N_PIECES).astype(int) == i

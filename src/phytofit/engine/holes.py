@@ -4,7 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, convolve1d
 
-from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.layout import State
+from phytofit.engine.mixture import Evaluation
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.sighting import clearly_lacking, strip_of
 from phytofit.engine.visibility import N_STRIPS, Hidden
 from phytofit.engine.voids import find_void
@@ -23,17 +25,15 @@ CLEARLY, FEW_ON_PIECE = 4.0, 3.0  # standard deviations of the number of points;
 EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which its strips are not told apart
 
 
-def find_holes(
-    likelihood: CloudLikelihood, state: State, scores: FloatArray, *, with_void: bool = False
-) -> Hidden | None:
-    """Where points of the leaf were not seen, None where all were; scores (n, k) of the points as the state gives them.
-    The void around its base is the one that the likelihood knows; `with_void`, one that is found anew, if there is."""
-    on_stem, on_leaf, _ = state.belongs(scores)
-    stem, leaf = move([organ.row(0) for organ in likelihood.model.organs(state.x)], likelihood.pose_of(state))
-    void = likelihood.void
+def find_holes(posterior: Posterior, state: State, at: Evaluation, *, with_void: bool = False) -> Hidden | None:
+    """Where points of the leaf were not seen, None where all were; `at` is the state evaluated.
+    The void around its base is the one that the posterior knows; `with_void`, one that is found anew, if there is."""
+    on_stem, on_leaf, _ = at.responsibilities.T
+    stem, leaf = move([organ.row(0) for organ in posterior.model.organs(state.x)], posterior.pose_of(state))
+    void = posterior.void
     if with_void:
-        void = find_void(likelihood.points, on_stem > 0.5, stem, leaf, noise_cm=float(state.noise[0])) or void
-    share = _lacking_share(likelihood.points[on_leaf > 0.5], stem, leaf, state.noise)
+        void = find_void(posterior.points, on_stem > 0.5, stem, leaf, noise_cm=float(state.noise[0])) or void
+    share = _lacking_share(posterior.points[on_leaf > 0.5], stem, leaf, state.noise)
     return Hidden(leaf, share, void) if void is not None or share.any() else None
 
 

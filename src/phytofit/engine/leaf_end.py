@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.layout import State
+from phytofit.engine.mixture import Evaluation
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.sighting import across_leaf
 from phytofit.models import move
 
@@ -61,7 +63,7 @@ class _Steps(NamedTuple):
         return tapered
 
 
-def points_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> PointsEnd | None:
+def points_end(posterior: Posterior, state: State, at: Evaluation) -> PointsEnd | None:
     """Where the leaf's last points say that it ends, whatever the rest of it is like; None where they are too few.
 
     Their places along and across the midrib are uniform, with normal noise, on a strip whose width falls as a power of
@@ -72,24 +74,24 @@ def points_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
 
     Parameters
     ----------
-    scores : (n, k) of the points, as the state gives them
+    at : the state evaluated
     """
     noise = float(state.noise[1])
-    length, at, across = _near_leaf(likelihood, state, scores)
-    if len(at) < LEAST_DECIDE:
+    length, place, across = _near_leaf(posterior, state, at)
+    if len(place) < LEAST_DECIDE:
         return None
-    last = float(at.max())
-    start = float(np.sort(at)[max(0, len(at) - 1 - N_DECIDE)])
+    last = float(place.max())
+    start = float(np.sort(place)[max(0, len(place) - 1 - N_DECIDE)])
     start = min(max(start, last - OUTERMOST * length), last - NEAREST * length)
-    there = at > start
+    there = place > start
     if np.count_nonzero(there) < LEAST_DECIDE:
         return None
-    along, lateral = (at[there] - start) / noise, across[there] / noise  # in units of the noise
+    along, lateral = (place[there] - start) / noise, across[there] / noise  # in units of the noise
     lateral -= np.median(lateral)
     far = float(along.max())
     step = FARTHEST * far / N_STEPS
     middles = step * (np.arange(N_STEPS, dtype=float) + 0.5)
-    steps = _Steps(middles, step, _seen_along(likelihood, state, start + middles * noise))
+    steps = _Steps(middles, step, _seen_along(posterior, state, start + middles * noise))
     ends = np.linspace(max(0.95 * far - 2.5, NEAREST_END * far), FARTHEST * far, N_ENDS)
     fits = _of_strips(ends, along, lateral, steps)
     i, _, j, _ = np.unravel_index(int(np.argmax(fits)), fits.shape)
@@ -103,14 +105,14 @@ def points_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) ->
     return PointsEnd(start + middle * noise, spread * noise)
 
 
-def _near_leaf(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+def _near_leaf(posterior: Posterior, state: State, at: Evaluation) -> tuple[float, FloatArray, FloatArray]:
     """Length of the fitted midrib, and places (n,) along it and sideways, cm, of the leaf's points, and of those near
     to its straight continuation, where the fitted leaf has none."""
-    length = float(likelihood.model.organs(state.x)[1].row(0).segment_lengths.sum())
-    place, across = across_leaf(likelihood, state, until=BEYOND)
+    length = float(posterior.model.organs(state.x)[1].row(0).segment_lengths.sum())
+    place, across = across_leaf(posterior, state, until=BEYOND)
     near = NEAR * np.array([state.noise[1], np.hypot(state.noise[1], state.noise[2])])
-    beyond = (place > 1.0) & (place < BEYOND) & (np.abs(across) < near).all(axis=1) & (likelihood.organ != 0)
-    theirs = (state.belongs(scores)[1] > 0.5) | beyond
+    beyond = (place > 1.0) & (place < BEYOND) & (np.abs(across) < near).all(axis=1) & (posterior.organ != 0)
+    theirs = (at.responsibilities[:, 1] > 0.5) | beyond
     return length, length * place[theirs], across[theirs, 0]
 
 
@@ -144,17 +146,17 @@ def _unevenness(along: FloatArray, expected: FloatArray, steps: _Steps) -> float
     return max(1.0, float(np.sum((found - wanted)[bands] ** 2 / wanted[bands])) / (N_BANDS - 3))
 
 
-def _seen_along(likelihood: CloudLikelihood, state: State, at: FloatArray) -> FloatArray:
+def _seen_along(posterior: Posterior, state: State, at: FloatArray) -> FloatArray:
     """Share (s,) of the leaf that was seen at places `at` (s,) along its midrib, cm."""
-    if likelihood.hidden is None:
+    if posterior.hidden is None:
         return np.ones(len(at))
-    leaf = move([likelihood.model.organs(state.x)[1].row(0)], likelihood.pose_of(state))[0]
+    leaf = move([posterior.model.organs(state.x)[1].row(0)], posterior.pose_of(state))[0]
     nodes = np.append(0.0, np.cumsum(leaf.segment_lengths))
     piece = np.clip(np.searchsorted(nodes, at) - 1, 0, len(leaf.frame) - 1)
     middle = leaf.axis[piece] + (at - nodes[piece])[:, np.newaxis] * leaf.frame[piece][:, :, 0]
     half = np.interp(at, nodes, leaf.half_width)
     across = [middle + (share * half)[:, np.newaxis] * leaf.frame[piece][:, :, 1] for share in ACROSS]
-    hidden = np.mean([likelihood.hidden.around(places) for places in across], axis=0)
+    hidden = np.mean([posterior.hidden.around(places) for places in across], axis=0)
     seen: FloatArray = np.maximum(1.0 - hidden, LEAST_SEEN)
     return seen
 
@@ -182,21 +184,21 @@ def combined(end: float, error: float, told: PointsEnd) -> tuple[float, float]:
 
 
 def ending(
-    likelihood: CloudLikelihood, state: State, scores: FloatArray, covariance: FloatArray, shared_cm: float = 0.0
+    posterior: Posterior, state: State, at: Evaluation, covariance: FloatArray, shared_cm: float = 0.0
 ) -> Ending:
     """Where the leaf ends, by its model and, where they are enough to tell, by its last points.
 
     Parameters
     ----------
-    scores : (n, k + 14) of the points, as the state gives them
+    at : the state evaluated
     covariance : (k + 14, k + 14) of the error of what was fitted
     shared_cm : error that the last points have in common
     """
-    told = points_end(likelihood, state, scores)
-    moved = _tip_moved(likelihood, state)
+    told = points_end(posterior, state, at)
+    moved = _tip_moved(posterior, state)
     of_tip = covariance @ moved
     error = float(np.sqrt(max(float(moved @ of_tip), 1e-12)))
-    length = float(likelihood.model.organs(state.x)[1].row(0).segment_lengths.sum())
+    length = float(posterior.model.organs(state.x)[1].row(0).segment_lengths.sum())
     end, left = length, float(np.hypot(error, MISFIT * length))
     if told is not None:
         end, left = combined(end, left, told._replace(error=float(np.hypot(told.error, shared_cm))))
@@ -204,12 +206,12 @@ def ending(
     return Ending(end / length, changed, bool(length - end > CLEARLY * left))
 
 
-def _tip_moved(likelihood: CloudLikelihood, state: State) -> FloatArray:
+def _tip_moved(posterior: Posterior, state: State) -> FloatArray:
     """How far (k + 14,) the fitted leaf's tip moves on, along its midrib, with each entry of theta."""
 
     def tip(theta: FloatArray) -> FloatArray:
-        there = likelihood.with_theta(state, theta)
-        pose, axis = likelihood.pose_of(there), likelihood.model.organs(there.x)[1].axis[0]
+        there = state.at(theta)
+        pose, axis = posterior.pose_of(there), posterior.organs(there)[1].axis
         place: FloatArray = axis[-2:] @ pose[:3, :3].T + pose[:3, 3]
         return place
 

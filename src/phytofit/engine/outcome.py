@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 from phytofit.engine.covariance import covariance_of, grown, misfit_of, mixed, of_sensor, shared_by_neighbors
 from phytofit.engine.dependence import Dependence, score_dependence, width_misfit
 from phytofit.engine.leaf_end import Ending, ending
-from phytofit.engine.refine import End, evidence_of, refinement
+from phytofit.engine.refine import Optimum, refinement
 from phytofit.engine.sighting import Sighting, sighting
 from phytofit.engine.tip import gain_of_blunt_end
 from phytofit.engine.whole_pieces import of_whole_pieces
@@ -26,7 +26,7 @@ TAPER = "leaf_taper"  # of a leaf that has one of its own, its last points tell 
 class Elsewhere(NamedTuple):
     """Where the leaf ends up that is free to start elsewhere than at the stem's surface, and how probable it is."""
 
-    end: End
+    end: Optimum
     dependence: Dependence
     probability: float
 
@@ -34,7 +34,7 @@ class Elsewhere(NamedTuple):
 class Chosen(NamedTuple):
     """The end that the cloud backs best."""
 
-    end: End
+    end: Optimum
     dependence: Dependence
     tip_doubtful: bool
     blunt: bool
@@ -88,26 +88,26 @@ class Estimate:
 
 def outcome(chosen: Chosen) -> Estimate:
     end, dependence = chosen.end, chosen.dependence
-    likelihood, state, at = end.likelihood, end.state, end.at
-    k = state.n_parameters
-    covariance, left = covariance_of(likelihood, state, at, dependence)
+    posterior, state, at = end.posterior, end.state, end.at
+    k = len(state.x)
+    covariance, left = covariance_of(posterior, state, at, dependence)
     if chosen.elsewhere is not None:
         other, of_other, p = chosen.elsewhere
-        there, _ = covariance_of(other.likelihood, other.state, other.at, of_other)
+        there, _ = covariance_of(other.posterior, other.state, other.at, of_other)
         covariance = mixed(covariance, there, other.state.theta - state.theta, p)
-    seen = sighting(likelihood, state, at.scores)
+    seen = sighting(posterior, state, at)
     too_long = state.seen == 1.0 and seen.short > EXPECTED_BEYOND * dependence.inflation
     ends = Ending(1.0, np.zeros_like(covariance))
-    if state.seen == 1.0 and (too_long or TAPER in likelihood.space.names):
-        ends = ending(likelihood, state, at.scores, covariance, shared_by_neighbors(dependence, state.noise))
-    blunt = ends.clearly_shorter and (gain_of_blunt_end(likelihood, state, at.scores) > BLUNTLY * dependence.inflation)
+    if state.seen == 1.0 and (too_long or TAPER in posterior.space.names):
+        ends = ending(posterior, state, at, covariance, shared_by_neighbors(dependence, state.noise))
+    blunt = ends.clearly_shorter and (gain_of_blunt_end(posterior, state, at) > BLUNTLY * dependence.inflation)
     x, covariance, converged = _with_width_of_whole_pieces(end, dependence, covariance[:k, :k])
     return Estimate(
         x=x,
         covariance=covariance,
         trait_covariance=covariance + ends.changed[:k, :k],
         too_long=too_long,
-        pose=likelihood.pose_of(state),
+        pose=posterior.pose_of(state),
         noise=state.noise,
         share=state.share,
         seen=state.seen,
@@ -116,10 +116,10 @@ def outcome(chosen: Chosen) -> Estimate:
         ends_at=ends.share,
         log_p=at.log_p,
         error=at.error,
-        evidence=evidence_of(end, dependence.inflation),
+        evidence=end.log_evidence(dependence.inflation),
         inflation=dependence.inflation,
         misfit_cm=misfit_of(dependence, state.noise),
-        width_misfit=width_misfit(likelihood, state, at.scores, of_sensor(dependence, state.noise)),
+        width_misfit=width_misfit(posterior, state, at, of_sensor(dependence, state.noise)),
         correlated_cm=dependence.leaf.reach_cm,
         rival=chosen.rival,
         quantile=float(stdtrit(left, 0.975)),
@@ -129,16 +129,16 @@ def outcome(chosen: Chosen) -> Estimate:
 
 
 def _with_width_of_whole_pieces(
-    end: End, dependence: Dependence, covariance: FloatArray
+    end: Optimum, dependence: Dependence, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray, bool]:
     """The model's parameters (k,) and the covariance (k, k) of their error, with the leaf's width as its whole pieces
     have it, and whether both refinements converged; as they are where there are no holes."""
-    k = end.state.n_parameters
-    whole = of_whole_pieces(end.likelihood, end.state)
+    k = len(end.state.x)
+    whole = of_whole_pieces(end.posterior, end.state)
     if whole is None:
         return end.state.x.copy(), covariance, end.converged
     refined = refinement(whole, end.state)
-    state = whole.with_theta(end.state, refined.theta)
+    state = end.state.at(refined.theta)
     of_part = score_dependence(whole, state, dependence)
     own, _ = covariance_of(whole, state, whole.evaluate(state), of_part)
-    return state.x.copy(), grown(covariance, own[:k, :k], whole.free[:k]), end.converged and refined.converged
+    return state.x.copy(), grown(covariance, own[:k, :k], whole.prior.free[:k]), end.converged and refined.converged

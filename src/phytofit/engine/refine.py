@@ -6,8 +6,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from phytofit.engine.evidence import log_evidence
 from phytofit.engine.holes import find_holes
-from phytofit.engine.likelihood import CloudLikelihood, Evaluation, State
+from phytofit.engine.layout import State
+from phytofit.engine.mixture import Evaluation
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.scoring import Refined, refine
 from phytofit.engine.visibility import Hidden
 from phytofit.species import Species
@@ -16,9 +19,8 @@ __all__ = [
     "COARSE_TOLERANCE",
     "FEW_POINTS",
     "Cloud",
-    "End",
-    "evidence_of",
-    "refined_end",
+    "Optimum",
+    "optimum_near",
     "refinement",
     "terms",
 ]
@@ -46,36 +48,43 @@ class Cloud(NamedTuple):
         organ = None if self.organ is None else self.organ[::stride]
         return self._replace(points=self.points[::stride], organ=organ, stride=self.stride * stride)
 
-    def likelihood(self, species: Species, **settings: Any) -> CloudLikelihood:
+    def posterior(
+        self, species: Species, *, thick: bool = False, cut: bool = False, hidden: Hidden | None = None
+    ) -> Posterior:
         weights = None if self.stride == 1 else np.full(len(self.points), float(self.stride))
-        return CloudLikelihood(
-            species.model,
-            species.space,
+        return Posterior.of(
+            species,
             self.points,
+            thick=thick,
+            cut=cut,
+            leaf_noise_cm=self.leaf_noise_cm,
             organ=self.organ,
             weights=weights,
-            leaf_noise_cm=self.leaf_noise_cm,
             executor=self.executor,
-            **settings,
+            hidden=hidden,
         )
 
 
-class End(NamedTuple):
+class Optimum(NamedTuple):
     """Where a refinement ended, evaluated there."""
 
-    likelihood: CloudLikelihood
+    posterior: Posterior
     state: State
     at: Evaluation
     converged: bool
 
     @property
-    def fit_of_points(self) -> float:
+    def log_likelihood(self) -> float:
         """Log probability of the points, each counted for those that it stands for."""
-        weights = self.likelihood.weights
+        weights = self.posterior.weights
         return float(self.at.log_p.sum() if weights is None else weights @ self.at.log_p)
 
+    def log_evidence(self, inflation: float) -> float:
+        """Log probability of the cloud; see :func:`phytofit.engine.evidence.log_evidence`."""
+        return log_evidence(self.posterior, self.state, self.at, inflation)
 
-def refined_end(
+
+def optimum_near(
     species: Species,
     state: State,
     cloud: Cloud,
@@ -84,25 +93,25 @@ def refined_end(
     cut: bool = False,
     hidden: Hidden | None = None,
     with_void: bool = False,
-) -> End:
+) -> Optimum:
     """Where the state leads to; `hidden` is what is known before of what was not seen.
 
     The void around the leaf's base stays as it is; `with_void`, it is found anew. Models that are compared must have
     the same, for points are always denser beside a larger one.
     """
     for number in range(HOLE_ROUNDS):
-        likelihood = cloud.likelihood(species, thick=thick, cut=cut, hidden=hidden)
-        state = likelihood.extended(state)
+        posterior = cloud.posterior(species, thick=thick, cut=cut, hidden=hidden)
+        state = posterior.extended(state)
         if number == 0 and len(cloud.points) >= 2 * FEW_POINTS:
-            few = cloud.part(FEW_POINTS).likelihood(species, thick=thick, cut=cut, hidden=hidden)
-            state = likelihood.with_theta(state, refinement(few, state, tolerance=COARSE_TOLERANCE).theta)
-        end = refinement(likelihood, state)
-        state = State(end.theta, state.pose, state.center)
-        at = likelihood.evaluate(state)
-        hidden = find_holes(likelihood, state, at.scores, with_void=with_void)
-        if _alike(hidden, likelihood.hidden):
+            few = cloud.part(FEW_POINTS).posterior(species, thick=thick, cut=cut, hidden=hidden)
+            state = state.at(refinement(few, state, tolerance=COARSE_TOLERANCE).theta)
+        end = refinement(posterior, state)
+        state = state.at(end.theta)
+        at = posterior.evaluate(state)
+        hidden = find_holes(posterior, state, at, with_void=with_void)
+        if _alike(hidden, posterior.hidden):
             break
-    return End(likelihood, state, at, end.converged)
+    return Optimum(posterior, state, at, end.converged)
 
 
 def _alike(one: Hidden | None, other: Hidden | None) -> bool:
@@ -116,28 +125,15 @@ def _alike(one: Hidden | None, other: Hidden | None) -> bool:
     return same and bool(np.abs(one.share - other.share).max() <= SAME_SHARE)
 
 
-def refinement(likelihood: CloudLikelihood, state: State, **limits: Any) -> Refined:
+def refinement(posterior: Posterior, state: State, **limits: Any) -> Refined:
     def evaluate(theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        return terms(likelihood, likelihood.with_theta(state, theta))
+        return terms(posterior, state.at(theta))
 
-    return refine(evaluate, state.theta, lower=likelihood.lower, upper=likelihood.upper, **limits)
+    return refine(evaluate, state.theta, lower=posterior.prior.lower, upper=posterior.prior.upper, **limits)
 
 
-def terms(likelihood: CloudLikelihood, state: State) -> tuple[float, FloatArray, FloatArray]:
+def terms(posterior: Posterior, state: State) -> tuple[float, FloatArray, FloatArray]:
     """Error, gradient (k,), and Fisher information by the scores' outer product, with the prior's (k, k)."""
-    at = likelihood.evaluate(state)
-    weighted = at.scores if likelihood.weights is None else at.scores * likelihood.weights[:, np.newaxis]
-    return at.error, likelihood.gradient(state, at), at.scores.T @ weighted + np.diag(likelihood.pull)
-
-
-def evidence_of(end: End, inflation: float) -> float:
-    """Laplace's approximation of the log probability of the cloud under the model, up to a constant of the cloud.
-
-    Points whose errors depend on each other count as `inflation` times fewer.
-    """
-    likelihood, theta, free, at = end.likelihood, end.state.theta, end.likelihood.free, end.at
-    precision = likelihood.precision[free]
-    information = (at.scores.T @ at.scores)[np.ix_(free, free)] / inflation + np.diag(precision)
-    surprise = 0.5 * np.sum((theta - likelihood.mean)[free] ** 2 * precision)
-    prior = 0.5 * np.sum(np.log(precision[precision > 0.0]))
-    return float(at.log_p.sum() / inflation - surprise + prior - 0.5 * np.linalg.slogdet(information)[1])
+    at = posterior.evaluate(state)
+    weighted = at.scores if posterior.weights is None else at.scores * posterior.weights[:, np.newaxis]
+    return at.error, posterior.gradient(state, at), at.scores.T @ weighted + np.diag(posterior.prior.curvature)

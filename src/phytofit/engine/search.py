@@ -1,6 +1,6 @@
 """The most probable phytomer of a cloud: refine from all starts, move on, choose the model."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
@@ -13,19 +13,19 @@ from scipy.special import expit
 
 from phytofit.engine.covariance import of_sensor
 from phytofit.engine.dependence import score_dependence
-from phytofit.engine.likelihood import NOISE, OUTLIERS, THICKNESS, CloudLikelihood, State
+from phytofit.engine.layout import State
 from phytofit.engine.outcome import Chosen, Elsewhere, Estimate, outcome
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.refine import (
     COARSE_TOLERANCE,
     FEW_POINTS,
     Cloud,
-    End,
-    evidence_of,
-    refined_end,
+    Optimum,
+    optimum_near,
     refinement,
     terms,
 )
-from phytofit.engine.restarts import along_points, longer_leaf, longer_stem, lower_insertion, turned_blade
+from phytofit.engine.restarts import along_points, longer, longer_leaf, longer_stem, lower_insertion, turned_blade
 from phytofit.engine.sighting import OFFSET, along_stem, sighting
 from phytofit.engine.tip import gain_of_blunt_end
 from phytofit.engine.visibility import Hidden
@@ -81,19 +81,21 @@ def _drawn_in(plain: Species, cloud: Cloud, begun: Sequence[tuple[FloatArray, Fl
     Where that leaves many points out, as beyond a hole, they are gone through again with wide noise and few outliers.
     """
     part = cloud._replace(executor=None).part(COARSE_POINTS)  # one thread a start
-    coarse, held = part.likelihood(plain), part.likelihood(plain)
+    coarse = part.posterior(plain)
     noise_cm = START_NOISE * float(plain.space.mean[plain.space.index("leaf_length")])
     states = [coarse.start(mean, pose, noise_cm) for mean, pose in begun]
     run = map if cloud.executor is None else cloud.executor.map
 
-    held.lower[NOISE], held.upper[OUTLIERS] = np.log(0.5 * noise_cm), np.log(HELD_OUTLIERS)
+    least = np.log(0.5 * noise_cm)
+    few_outliers = coarse.prior.bounded("stem_noise", lower=least).bounded("leaf_noise", lower=least)
+    held = coarse.under(few_outliers.bounded("outlier_share", upper=np.log(HELD_OUTLIERS)))
 
     def refined(
-        states: Sequence[State], max_iterations: int, likelihood: CloudLikelihood = coarse
+        states: Sequence[State], max_iterations: int, posterior: Posterior = coarse
     ) -> list[tuple[float, State]]:
-        call = partial(refinement, likelihood, max_iterations=max_iterations, tolerance=COARSE_TOLERANCE)
+        call = partial(refinement, posterior, max_iterations=max_iterations, tolerance=COARSE_TOLERANCE)
         ends = zip(run(call, states), states, strict=True)
-        return [(end.error, State(end.theta, state.pose, state.center)) for end, state in ends]
+        return [(end.error, state.at(end.theta)) for end, state in ends]
 
     scouted = refined(states, SCOUT_ITERATIONS)
     enough = min(error for error, _ in scouted) + HOPELESS * len(cloud.points)
@@ -103,98 +105,99 @@ def _drawn_in(plain: Species, cloud: Cloud, begun: Sequence[tuple[FloatArray, Fl
     return min(found, key=itemgetter(0))[1]
 
 
-def _candidates(plain: Species, species: Species, cloud: Cloud, state: State) -> list[End]:
+def _candidates(plain: Species, species: Species, cloud: Cloud, state: State) -> list[Optimum]:
     """Refined: the paper's model, the same with its tip missing, and, if they promise enough, the two with all
     parameters of the species."""
-    found = [refined_end(plain, state, cloud, with_void=True)]
-    hidden = found[0].likelihood.hidden
-    found.append(refined_end(plain, _cut(found[0].state), cloud, cut=True, hidden=hidden))
+    found = [optimum_near(plain, state, cloud, with_void=True)]
+    hidden = found[0].posterior.hidden
+    found.append(optimum_near(plain, _cut(found[0].state), cloud, cut=True, hidden=hidden))
     if len(plain.space) == len(species.space):
         return found
-    simple = found[1] if found[1].fit_of_points - found[0].fit_of_points > TIP_MISSING else found[0]
+    simple = found[1] if found[1].log_likelihood - found[0].log_likelihood > TIP_MISSING else found[0]
     if _promise(species, simple, cloud) <= SHAPE_PROMISE:
         return found
     rich = _rich(species, cloud, found[0])
-    if rich[0].likelihood.void is not found[0].likelihood.void:  # all are to have the same
+    if rich[0].posterior.void is not found[0].posterior.void:  # all are to have the same
         hidden = _void_alone(rich[0])
-        found = [refined_end(plain, it.state, cloud, cut=i == 1, hidden=hidden) for i, it in enumerate(found)]
+        found = [optimum_near(plain, it.state, cloud, cut=i == 1, hidden=hidden) for i, it in enumerate(found)]
     return [*found, *rich]
 
 
-def _void_alone(end: End) -> Hidden | None:
+def _void_alone(end: Optimum) -> Hidden | None:
     """What was not seen around the leaf's base, for a model that is to find its holes itself."""
-    hidden = end.likelihood.hidden
+    hidden = end.posterior.hidden
     return None if hidden is None or hidden.void is None else hidden.without_holes()
 
 
-def _rich(species: Species, cloud: Cloud, simple: End) -> tuple[End, End]:
-    """With all parameters of the species, whole and with the tip missing: where the best of several beginnings leads
-    to, which is found with a part of the points."""
+def _rich(species: Species, cloud: Cloud, simple: Optimum) -> tuple[Optimum, Optimum]:
+    """With all parameters of the species, whole and with the tip missing: the best optimum of several restarts, which
+    is found with a part of the points."""
     cloud = cloud._replace(leaf_noise_cm=float(simple.state.noise[0]))
     part = cloud.part(FEW_POINTS)
-    begun = [simple.state, *turned_blade(species, simple.likelihood, simple.state, simple.at.scores)]
     known = _void_alone(simple)
-    best = max(
-        (refined_end(species, it, part, thick=True, hidden=known) for it in begun), key=lambda end: end.fit_of_points
-    )
-    best = _elsewhere(species, part, best, LOWER_ROUNDS)
-    best = refined_end(species, best.state, cloud, thick=True, hidden=best.likelihood.hidden, with_void=True)
-    best = _elsewhere(species, cloud, best, 1)
-    hidden = best.likelihood.hidden
-    begun = [_cut(best.state, share) for share in CUT_SHARES]
+    richer = part.posterior(species, thick=True, hidden=known)
+    extended = richer.extended(simple.state)
+    starts = [extended, *turned_blade(Optimum(richer, extended, richer.evaluate(extended), converged=False))]
+    best = max((optimum_near(species, it, part, thick=True, hidden=known) for it in starts), key=_log_likelihood)
+    best = _restarted(species, part, best, LOWER_ROUNDS)
+    best = optimum_near(species, best.state, cloud, thick=True, hidden=best.posterior.hidden, with_void=True)
+    best = _restarted(species, cloud, best, 1)
+    hidden = best.posterior.hidden
+    starts = [_cut(best.state, share) for share in CUT_SHARES]
     cut = max(
-        (refined_end(species, it, part, thick=True, cut=True, hidden=hidden) for it in begun),
-        key=lambda end: end.fit_of_points,
+        (optimum_near(species, it, part, thick=True, cut=True, hidden=hidden) for it in starts), key=_log_likelihood
     )
-    return best, refined_end(species, cut.state, cloud, thick=True, cut=True, hidden=cut.likelihood.hidden)
+    return best, optimum_near(species, cut.state, cloud, thick=True, cut=True, hidden=cut.posterior.hidden)
 
 
-def _elsewhere(species: Species, cloud: Cloud, best: End, rounds: int) -> End:
-    """The best so far, or where a turned blade, more leaf or stem, a midrib along the points, or an insertion lower
-    down leads to, if it fits better."""
-    best = _better(species, cloud, best, turned_blade(species, best.likelihood, best.state, best.at.scores))
-    best = _better(species, cloud, best, longer_leaf(best.state))
-    best = _better(species, cloud, best, longer_stem(best.likelihood, best.state, best.at.scores))
-    best = _better(species, cloud, best, along_points(species, best.likelihood, best.state, best.at.scores))
+def _log_likelihood(optimum: Optimum) -> float:
+    return optimum.log_likelihood
+
+
+def _restarted(species: Species, cloud: Cloud, best: Optimum, rounds: int) -> Optimum:
+    """The best optimum so far, or that of a restart which fits better: with a turned blade, more leaf or stem, a
+    midrib along the points, or, so many times in a row, an insertion lower down."""
+    for restart in (turned_blade, longer_leaf, longer_stem, along_points):
+        best = _better(species, cloud, best, restart)
     for _ in range(rounds):
-        lower = _better(species, cloud, best, lower_insertion(species, best.state))
+        lower = _better(species, cloud, best, lower_insertion)
         if lower is best:
             break
         best = lower
     return best
 
 
-def _better(species: Species, cloud: Cloud, best: End, begun: Iterable[State]) -> End:
-    """Of the best so far and what other beginnings lead to, that which clearly fits better."""
-    for state in begun:
-        end = refined_end(species, state, cloud, thick=True, hidden=best.likelihood.hidden)
-        if end.fit_of_points > best.fit_of_points + CLEARLY_BETTER:
-            best = end
+def _better(species: Species, cloud: Cloud, best: Optimum, restart: Callable[[Optimum], Iterable[State]]) -> Optimum:
+    """Of the best so far and the optima of a restart, that which clearly fits better."""
+    for state in restart(best):
+        optimum = optimum_near(species, state, cloud, thick=True, hidden=best.posterior.hidden)
+        if optimum.log_likelihood > best.log_likelihood + CLEARLY_BETTER:
+            best = optimum
     return best
 
 
-def _choice(found: Sequence[End]) -> Chosen:
+def _choice(found: Sequence[Optimum]) -> Chosen:
     """Of models whole and with the tip missing, in turn, the one with the most evidence; a tip is missing only where
     that makes the points clearly more probable.
 
     Of a richer leaf the taper is estimated too, and says little of a tip that was not seen: it is taken as whole.
     """
     richest = found[-1]  # least misfit
-    dependence = score_dependence(richest.likelihood, richest.state)
+    dependence = score_dependence(richest.posterior, richest.state)
     inflation, sensors = dependence.inflation, of_sensor(dependence, richest.state.noise)
     if sensors.correlation < dependence.leaf.correlation:  # the rest is misfit, of which a better model has less
         without = replace(dependence, leaf=sensors)
-        inflation = score_dependence(richest.likelihood, richest.state, without).inflation
-    fits = [end.fit_of_points / dependence.inflation for end in found]
+        inflation = score_dependence(richest.posterior, richest.state, without).inflation
+    fits = [end.log_likelihood / dependence.inflation for end in found]
     gains = [0.0] * len(found)  # by a missing tip
     for whole in range(0, len(found), 2):
         gain = fits[whole + 1] - fits[whole]
         if gain > TIP_DOUBTFUL:  # if the leaf's end says so too, not only its shape elsewhere
             end = found[whole]
-            gain = min(gain, gain_of_blunt_end(end.likelihood, end.state, end.at.scores) / dependence.inflation)
+            gain = min(gain, gain_of_blunt_end(end.posterior, end.state, end.at) / dependence.inflation)
         gains[whole] = gains[whole + 1] = gain
     odds = [0.0, 0.0, RARE, RARE]
-    evidence = [evidence_of(end, inflation) + o for end, o in zip(found, odds, strict=False)]
+    evidence = [end.log_evidence(inflation) + o for end, o in zip(found, odds, strict=False)]
     backed = [e if i % 2 == 0 or gains[i] > TIP_MISSING else -np.inf for i, e in enumerate(evidence)]
     best = int(np.argmax(backed))
     others = [i for i in range(len(found)) if i // 2 != best // 2 and backed[i] > backed[best] - ABOUT_AS_PROBABLE]
@@ -202,20 +205,21 @@ def _choice(found: Sequence[End]) -> Chosen:
     blunt = best == RICH_CUT
     best -= blunt
     if best < len(found) - 1:
-        dependence = score_dependence(found[best].likelihood, found[best].state, dependence)
+        dependence = score_dependence(found[best].posterior, found[best].state, dependence)
     doubtful = best % 2 == 0 and gains[best] > TIP_DOUBTFUL
     return Chosen(found[best], dependence, doubtful, blunt, rival)
 
 
 def _one_sided(chosen: Chosen) -> Chosen:
     """Of a stem that was seen from one side, the fit that knows it, where it has more evidence."""
-    free = chosen.end.likelihood.one_sided()
+    one_sided = chosen.end.posterior
+    free = one_sided.under(one_sided.prior.one_sided())
     refined = refinement(free, chosen.end.state)
-    there = free.with_theta(chosen.end.state, refined.theta)
+    there = chosen.end.state.at(refined.theta)
     if np.linalg.norm(there.facing) < LEAST_FACING:
         return chosen
-    end = End(free, there, free.evaluate(there), refined.converged)
-    lead = evidence_of(end, chosen.dependence.inflation) - evidence_of(chosen.end, chosen.dependence.inflation)
+    end = Optimum(free, there, free.evaluate(there), refined.converged)
+    lead = end.log_evidence(chosen.dependence.inflation) - chosen.end.log_evidence(chosen.dependence.inflation)
     if lead < 0.0:
         return chosen
     return chosen._replace(end=end, dependence=score_dependence(free, there))
@@ -225,17 +229,15 @@ def _with_hidden_base(chosen: Chosen) -> Chosen:
     """Where a leaf starts, if that was not seen, as the prior has it beside what the rest of the leaf says: its points
     count as fewer for that, since they err alike, by noise or as the model does not fit them."""
     end, inflation = chosen.end, chosen.dependence.inflation
-    if OFFSET not in end.likelihood.space.names or inflation == 1.0:
+    if OFFSET not in end.posterior.space.names or inflation == 1.0:
         return chosen
-    if sighting(end.likelihood, end.state, end.at.scores).shows_base:
+    if sighting(end.posterior, end.state, end.at).shows_base:
         return chosen
-    of_start = np.zeros(len(end.state.theta), bool)
-    of_start[: end.state.n_parameters] = np.isin(end.likelihood.space.names, OF_START)
-    careful = end.likelihood.with_prior(of_start, inflation)
+    careful = end.posterior.under(end.posterior.prior.weighted(end.state.layout.mask(*OF_START), inflation))
     refined = refinement(careful, end.state)
-    there = careful.with_theta(end.state, refined.theta)
+    there = end.state.at(refined.theta)
     return chosen._replace(
-        end=End(careful, there, careful.evaluate(there), refined.converged),
+        end=Optimum(careful, there, careful.evaluate(there), refined.converged),
         dependence=score_dependence(careful, there, chosen.dependence),
     )
 
@@ -243,16 +245,15 @@ def _with_hidden_base(chosen: Chosen) -> Chosen:
 def _at_surface(species: Species, chosen: Chosen) -> Chosen:
     """Of a leaf that rises along its stem, a little inside it, the one that starts at its surface, if that is the more
     probable: there leaves grow, and a cloud hardly tells."""
-    free, state = chosen.end.likelihood, chosen.end.state
+    free, state = chosen.end.posterior, chosen.end.state
     if not along_stem(free, state):
         return chosen
-    start, place = state.theta.copy(), species.space.index(OFFSET)
-    start[place] = 1.0
-    held = free.holding(free.with_theta(state, start), np.arange(len(start)) == place)
-    refined = refinement(held, free.with_theta(state, start))
-    there = held.with_theta(state, refined.theta)
-    end = End(held, there, held.evaluate(there), refined.converged)
-    lead = evidence_of(end, chosen.dependence.inflation) - evidence_of(chosen.end, chosen.dependence.inflation)
+    at_surface = state.changed(**{OFFSET: 1.0})
+    held = free.under(free.prior.fixing(at_surface.theta, state.layout.mask(OFFSET)))
+    refined = refinement(held, at_surface)
+    there = state.at(refined.theta)
+    end = Optimum(held, there, held.evaluate(there), refined.converged)
+    lead = end.log_evidence(chosen.dependence.inflation) - chosen.end.log_evidence(chosen.dependence.inflation)
     if lead < 0.0:
         return chosen
     return chosen._replace(
@@ -262,20 +263,16 @@ def _at_surface(species: Species, chosen: Chosen) -> Chosen:
     )
 
 
-def _promise(species: Species, end: End, cloud: Cloud) -> float:
+def _promise(species: Species, end: Optimum, cloud: Cloud) -> float:
     """Log probability that a richer leaf is expected to gain over the fitted one, by Rao's score test."""
-    likelihood = cloud.likelihood(species, cut=True, hidden=end.likelihood.hidden)
-    state = likelihood.extended(end.state)
-    state.theta[THICKNESS] = end.state.theta[THICKNESS]
-    _, gradient, information = terms(likelihood, state)
-    free = np.arange(len(gradient)) != state.n_parameters  # the tip is another question
+    posterior = cloud.posterior(species, cut=True, hidden=end.posterior.hidden)
+    state = posterior.extended(end.state).changed(leaf_thickness=end.state["leaf_thickness"])
+    _, gradient, information = terms(posterior, state)
+    free = ~state.layout.mask("midrib_seen")  # the tip is another question
     inverse = pinvh(information[np.ix_(free, free)])  # with labels, points may say nothing of a share
     return 0.5 * float(gradient[free] @ inverse @ gradient[free])
 
 
 def _cut(state: State, share: float = CUT_SHARES[0]) -> State:
     """The state with a longer leaf, of which as much is seen as of the one that it had."""
-    theta = state.theta.copy()
-    theta[[3, 5]] /= share  # the bend is a thirtieth of the leaf's
-    theta[state.n_parameters] = share
-    return State(theta, state.pose, state.center)
+    return longer(state, 1.0 / share).changed(midrib_seen=share)

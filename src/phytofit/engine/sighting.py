@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.layout import State
+from phytofit.engine.mixture import Evaluation
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.unexplained import on_something_else
 from phytofit.models import LEAF, Organ, move
 from phytofit.traits import measure
@@ -75,12 +77,12 @@ class Sighting:
         return self.base and bool(np.any(self.sections[:BASE_SECTIONS] >= SEEN_DENSITY))
 
 
-def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> Sighting:
-    """What of the phytomer the cloud shows; scores (n, k) of the points as `state` gives them."""
-    on_stem, on_leaf, outlier = state.belongs(scores)
-    pose = likelihood.pose_of(state)
-    points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]  # in the model's frame
-    leaf = likelihood.model.organs(state.x)[1].row(0)
+def sighting(posterior: Posterior, state: State, at: Evaluation) -> Sighting:
+    """What of the phytomer the cloud shows; `at` is the state evaluated."""
+    on_stem, on_leaf, outlier = at.responsibilities.T
+    pose = posterior.pose_of(state)
+    points = (posterior.points - pose[:3, 3]) @ pose[:3, :3]  # in the model's frame
+    leaf = posterior.model.organs(state.x)[1].row(0)
     place = _area_share(leaf, points)
     gaps = _gaps(leaf, points[on_leaf > 0.5], place[on_leaf > 0.5])
     weight = np.where(on_leaf > 0.5, on_leaf, 0.0)
@@ -90,11 +92,11 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
     angle = np.arctan2(stem_points[:, 1], stem_points[:, 0])
     sector = np.bincount(((angle + np.pi) / (2 * np.pi) * N_SECTORS).astype(int) % N_SECTORS, minlength=N_SECTORS)
     shown = np.mean(sector > SEEN_DENSITY * np.quantile(sector, 0.75)) if len(stem_points) else 0.0
-    beyond = _beyond_tip(likelihood, state, scores)
-    end = float(across_leaf(likelihood, state)[0][on_leaf > 0.5].max(initial=0.0))
+    beyond = _beyond_tip(posterior, state, at)
+    end = float(across_leaf(posterior, state)[0][on_leaf > 0.5].max(initial=0.0))
     short = float(on_leaf.sum() * (1.0 - place[on_leaf > 0.5].max(initial=0.0)))
-    risen = along_stem(likelihood, state)
-    void, start = likelihood.void, pose[:3, :3] @ leaf.axis[0] + pose[:3, 3]
+    risen = along_stem(posterior, state)
+    void, start = posterior.void, pose[:3, :3] @ leaf.axis[0] + pose[:3, 3]
     return Sighting(
         found / typical,
         float(on_stem.sum()),
@@ -105,17 +107,17 @@ def sighting(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> S
         short,
         risen,
         float(on_leaf.sum()),
-        bool(likelihood.prior_weight.max() == 1.0) and (void is None or bool(void.larger().at(start) < HIDDEN_BASE)),
-        np.count_nonzero(on_something_else(points[outlier > 0.5], likelihood.outlier_density)) / len(points),
+        bool(posterior.prior.weight.max() == 1.0) and (void is None or bool(void.larger().at(start) < HIDDEN_BASE)),
+        np.count_nonzero(on_something_else(points[outlier > 0.5], posterior.outlier_density)) / len(points),
     )
 
 
-def along_stem(likelihood: CloudLikelihood, state: State) -> float:
+def along_stem(posterior: Posterior, state: State) -> float:
     """How much of the midrib, cm, lies inside the stem where it starts nearer to the stem's surface than the leaf's
     points scatter, so that it may as well be outside; 0 if it is not worth a remark, or the model has no such leaf."""
-    if OFFSET not in likelihood.space.names:
+    if OFFSET not in posterior.space.names:
         return 0.0
-    stem, leaf = (organ.row(0) for organ in likelihood.model.organs(state.x))
+    stem, leaf = (organ.row(0) for organ in posterior.model.organs(state.x))
     whole = float(leaf.segment_lengths.sum())
     outside = next(trait.value for trait in measure((stem, leaf)) if trait.name == "leaf_length")
     surface = np.interp(leaf.axis[0, 2], stem.axis[:, 2], stem.half_width)
@@ -159,33 +161,31 @@ def strip_of(leaf: Organ, points: FloatArray, n_strips: int) -> NDArray[np.intp]
     return strip
 
 
-def _beyond_tip(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> int:
+def _beyond_tip(posterior: Posterior, state: State, at: Evaluation) -> int:
     """Number of points near the leaf's tip that are of no organ, 0 if there are not more than outliers would be there
     by chance: the leaf may go on there, where the model does not."""
-    outlier = state.belongs(scores)[2]
-    leaf = move([likelihood.model.organs(state.x)[1].row(0)], likelihood.pose_of(state))[0]
+    outlier = at.responsibilities[:, 2]
+    leaf = move([posterior.model.organs(state.x)[1].row(0)], posterior.pose_of(state))[0]
     near = NEAR_TIP * leaf.segment_lengths.sum()
-    there = likelihood.points[(outlier > 0.5) & (np.linalg.norm(likelihood.points - leaf.axis[-1], axis=1) < near)]
+    there = posterior.points[(outlier > 0.5) & (np.linalg.norm(posterior.points - leaf.axis[-1], axis=1) < near)]
     if len(there) <= FEW_BEYOND:
         return 0
     offset = np.random.default_rng(0).uniform(-near, near, (N_BEYOND, 3))  # how much of the hull lies near the tip
     around = leaf.axis[-1] + offset[np.linalg.norm(offset, axis=1) < near]
-    planes = ConvexHull(likelihood.points).equations
+    planes = ConvexHull(posterior.points).equations
     inside = np.mean(np.all(around @ planes[:, :3].T + planes[:, 3] < 0.0, axis=1))
-    expected = float(outlier.sum()) * inside * 4.0 / 3.0 * np.pi * near**3 * likelihood.outlier_density
+    expected = float(outlier.sum()) * inside * 4.0 / 3.0 * np.pi * near**3 * posterior.outlier_density
     return len(there) if len(there) > expected + CLEARLY * np.sqrt(expected) else 0
 
 
-def across_leaf(
-    likelihood: CloudLikelihood, state: State, *, until: float | None = None
-) -> tuple[FloatArray, FloatArray]:
+def across_leaf(posterior: Posterior, state: State, *, until: float | None = None) -> tuple[FloatArray, FloatArray]:
     """Share (n,) of the midrib at which each point lies, and where (n, 2) across it: cm sideways, and off the blade.
 
     With `until`, a share of more than 1, the midrib goes straight on so far, and beyond that.
     """
-    pose = likelihood.pose_of(state)
-    points = (likelihood.points - pose[:3, 3]) @ pose[:3, :3]
-    leaf = likelihood.model.organs(state.x)[1].row(0)
+    pose = posterior.pose_of(state)
+    points = (posterior.points - pose[:3, 3]) @ pose[:3, :3]
+    leaf = posterior.model.organs(state.x)[1].row(0)
     whole = leaf.segment_lengths.sum()
     leaf = leaf if until is None else leaf.until(until)
     j, along = leaf.nearest(points)

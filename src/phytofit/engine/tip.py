@@ -5,7 +5,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import ndtr
 
-from phytofit.engine.likelihood import CloudLikelihood, State
+from phytofit.engine.layout import State
+from phytofit.engine.mixture import Evaluation
+from phytofit.engine.posterior import Posterior
 from phytofit.engine.sighting import across_leaf
 
 __all__ = ["gain_of_blunt_end"]
@@ -18,7 +20,7 @@ FARTHEST = 10.0  # logarithms of lengths, in units of the noise, that the search
 POINTED, STRAY = 1e-3, 1e-9  # of the noise: a width that is none; density of points that the strip does not explain
 
 
-def gain_of_blunt_end(likelihood: CloudLikelihood, state: State, scores: FloatArray) -> float:
+def gain_of_blunt_end(posterior: Posterior, state: State, at: Evaluation) -> float:
     """Log probability, nats, that the points at the end of a whole leaf gain if it may end bluntly; infinite where they
     are too few to tell.
 
@@ -29,11 +31,11 @@ def gain_of_blunt_end(likelihood: CloudLikelihood, state: State, scores: FloatAr
     Parameters
     ----------
     state : of a leaf that is taken as whole
-    scores : (n, k) of the points, as the state gives them
+    at : the state evaluated
     """
-    on_leaf = state.belongs(scores)[1]
-    place, across = across_leaf(likelihood, state)
-    leaf = likelihood.model.organs(state.x)[1].row(0)
+    on_leaf = at.responsibilities[:, 1]
+    place, across = across_leaf(posterior, state)
+    leaf = posterior.model.organs(state.x)[1].row(0)
     length = float(leaf.segment_lengths.sum())
     there = (on_leaf > 0.5) & (place > 1.0 - WINDOW)
     if np.count_nonzero(there) < LEAST_THERE:

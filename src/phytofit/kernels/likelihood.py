@@ -1,10 +1,10 @@
-"""Density of points that lie on a phytomer's surface, with noise, and its derivatives."""
+"""Density of points that come from tubes and strips, with noise, and its derivatives: one organ at a time."""
 
 import numpy as np
 
 from phytofit.kernels.compiling import kernel
 
-__all__ = ["CHANGES", "log_density", "segment_changes"]
+__all__ = ["CHANGES", "add_scores", "segment_changes", "strip_density", "tube_density"]
 
 REACH = 5.5  # noise levels from a surface at which its density counts as none: e^-15 of the greatest
 CHANGES = 9  # of a segment: translation (3), rotation (3), length, half widths (a stem's radii) at both ends
@@ -80,200 +80,201 @@ def _normal(z):
 
 
 @kernel
-def log_density(
-    points, organ, seen,
-    leaf_origin, leaf_frame, leaf_length, leaf_half, leaf_area, leaf_change, leaf_area_change,
-    stem_origin, stem_frame, stem_length, stem_radius, stem_area, stem_change, stem_area_change,
-    facing, noise, share, outlier_density,
-    log_p, scores,
+def tube_density(
+    points, weight, origin, frame, length, radius, area, facing, noise, change, area_change, density, derivative
 ):  # fmt: skip
-    """Log density of points, each from the stem's surface, the leaf's, or an outlier, and its derivatives.
+    """Add the density of points that come from a tube, and its derivatives.
 
-    A point of an organ is uniform on its surface, displaced by isotropic normal noise; but around a tube, which may
-    have been seen from one side, its angle has a von Mises density.  For a flat patch the density is a normal density
-    across it times differences of error functions along and across; for a tube, a ring blurred by noise times such a
-    difference along the axis.  With R the radius, s the noise and p the place across the axis, the ring's is
+    A point is uniform along the tube, displaced by isotropic normal noise; around it, as it may have been seen from one
+    side, its angle has a von Mises density.  The density is a ring blurred by noise, times a difference of normal
+    distributions along the axis.  With R the radius, s the noise and p the place across the axis, the ring's is
     exp(-(p² + R²) / 2 s²) I0(|R p / s² + facing|) / (2 pi s² I0(|facing|)): a Rice density where it faces nowhere.
 
     Parameters
     ----------
     points : (n, 3)
-    organ : (n,) int8: 0 stem, 1 leaf; -1 unknown, may be of either
-    seen : (n,) share of the leaf's points that is seen where each lies
-    leaf_origin (m, 3), leaf_frame (m, 3, 3) columns tangent, lateral, normal, leaf_length (m,), leaf_half (m + 1,) :
-        the leaf's segments, and half widths at the nodes
-    leaf_area : of the leaf, as far as it was seen
-    stem_origin (s, 3), stem_frame (s, 3, 3) columns tangent and two across, stem_length (s,), stem_radius (s,) : the
-        stem's segments
-    stem_area : of the stem, as far as it was seen
-    leaf_change (m, 9, k), leaf_area_change (k,), stem_change (s, 9, k), stem_area_change (k,) : change of a segment,
-        in its own frame, and of the logarithm of the organ's area, for a unit change of each
-        of k parameters
-    facing : (2,) von Mises concentration of the stem's points, towards a side, in the frame across it
-    noise : (3,) standard deviation: on the stem; on the leaf; and what its thickness adds to that across the blade
-    share : (3,) of the points: stem, leaf, outliers
-    outlier_density : of an outlier, per volume
-    log_p : (n,), filled with the log density
-    scores : (n, k + 7), filled with its derivatives by the k parameters, by what the stem faces, by the logarithms of
-        the three noises, and by the logits of the shares of stem and outliers (relative to the leaf's); or (0, 0): not
-        wanted
+    weight : (n,) by which the density is multiplied at each point; where it is 0, nothing is computed
+    origin (s, 3), frame (s, 3, 3) columns tangent and two across, length (s,), radius (s,) : the tube's segments
+    area : of the tube, as far as it was seen
+    facing : (2,) von Mises concentration of the points, towards a side, in the frame across the tube
+    noise : standard deviation
+    change (s, 9, k), area_change (k,) : change of a segment, in its own frame, and of the logarithm of the area, for a
+        unit change of each of k parameters
+    density : (n,), added to
+    derivative : (n, k + 3), to which the derivatives by the k parameters, by `facing` and by the logarithm of the noise
+        are added; or (0, 0): not wanted
     """
-    n = points.shape[0]
-    m = leaf_origin.shape[0]
-    k = stem_change.shape[2]
-    wanted = scores.shape[0] > 0
-    stem_noise, leaf_noise, thickness = noise[0], noise[1], np.hypot(noise[1], noise[2])
-    far, reach, depth = REACH * stem_noise, REACH * leaf_noise, REACH * thickness
-    stem_square, leaf_square = stem_noise * stem_noise, leaf_noise * leaf_noise
-    thin = leaf_square / (thickness * thickness)
-    floor = share[2] * outlier_density
+    wanted = derivative.shape[0] > 0
+    k = change.shape[2]
+    far, square = REACH * noise, noise * noise
     facing_v, facing_w = facing[0], facing[1]
     one_sided = np.sqrt(facing_v * facing_v + facing_w * facing_w)
     at_all_sides, mean_facing = _bessel(one_sided)
     mean_facing = mean_facing / one_sided if one_sided > 0.0 else 0.5
-    for i in range(n):
-        on_stem = 0.0
-        on_leaf = 0.0
-        if wanted:
-            for c in range(k + 7):
-                scores[i, c] = 0.0
-        if organ[i] != 1:
-            for j in range(len(stem_length)):
-                x, y, z = (
-                    points[i, 0] - stem_origin[j, 0],
-                    points[i, 1] - stem_origin[j, 1],
-                    points[i, 2] - stem_origin[j, 2],
-                )
-                u = stem_frame[j, 0, 0] * x + stem_frame[j, 1, 0] * y + stem_frame[j, 2, 0] * z
-                length, radius = stem_length[j], stem_radius[j]
-                if u < -far or u > length + far or length <= 0.0:
-                    continue
-                v = stem_frame[j, 0, 1] * x + stem_frame[j, 1, 1] * y + stem_frame[j, 2, 1] * z
-                w = stem_frame[j, 0, 2] * x + stem_frame[j, 1, 2] * y + stem_frame[j, 2, 2] * z
-                rho = np.sqrt(v * v + w * w)
-                if rho > radius + far or rho < radius - far:
-                    continue
-                from_foot, at_foot = _normal(u / stem_noise)
-                from_top, at_top = _normal((u - length) / stem_noise)
-                along = from_foot - from_top
-                if along <= 0.0:
-                    continue
-                pull_v, pull_w = radius * v / stem_square + facing_v, radius * w / stem_square + facing_w
-                pull = np.sqrt(pull_v * pull_v + pull_w * pull_w)
-                bessel, ratio = _bessel(pull)
-                ratio = ratio / pull if pull > 0.0 else 0.5
-                gap = rho - radius
-                exponent = pull - rho * radius / stem_square - one_sided - 0.5 * gap * gap / stem_square
-                around = np.exp(exponent) * bessel / (2.0 * np.pi * stem_square * at_all_sides)
-                density = share[0] * 2.0 * np.pi * radius / stem_area * around * along
-                if density <= 0.0:
-                    continue
-                on_stem += density
-                if wanted:
-                    at_foot /= stem_noise * along
-                    at_top /= stem_noise * along
-                    by_u = density * (at_foot - at_top)
-                    by_length = density * at_top
-                    towards = ratio * (pull_v * v + pull_w * w)
-                    by_half = 0.5 * density * ((towards - radius) / stem_square + 1.0 / radius)
-                    by_v = density * (radius * ratio * pull_v - v) / stem_square
-                    by_w = density * (radius * ratio * pull_w - w) / stem_square
-                    change = stem_change[j]
-                    for c in range(k):
-                        scores[i, c] += (
-                            by_length * change[6, c]
-                            + by_half * (change[7, c] + change[8, c])
-                            - by_u * (change[0, c] + change[4, c] * w - change[5, c] * v)
-                            - by_v * (change[1, c] + change[5, c] * u - change[3, c] * w)
-                            - by_w * (change[2, c] + change[3, c] * v - change[4, c] * u)
-                        )
-                    scores[i, k] += density * (ratio * pull_v - mean_facing * facing_v)
-                    scores[i, k + 1] += density * (ratio * pull_w - mean_facing * facing_w)
-                    scores[i, k + 2] += density * (
-                        -2.0
-                        + (rho * rho + radius * radius - 2.0 * radius * towards) / stem_square
-                        - (u * at_foot - (u - length) * at_top)
+    for i in range(points.shape[0]):
+        if weight[i] == 0.0:
+            continue
+        for j in range(len(length)):
+            x, y, z = points[i, 0] - origin[j, 0], points[i, 1] - origin[j, 1], points[i, 2] - origin[j, 2]
+            u = frame[j, 0, 0] * x + frame[j, 1, 0] * y + frame[j, 2, 0] * z
+            long, r = length[j], radius[j]
+            if u < -far or u > long + far or long <= 0.0:
+                continue
+            v = frame[j, 0, 1] * x + frame[j, 1, 1] * y + frame[j, 2, 1] * z
+            w = frame[j, 0, 2] * x + frame[j, 1, 2] * y + frame[j, 2, 2] * z
+            rho = np.sqrt(v * v + w * w)
+            if rho > r + far or rho < r - far:
+                continue
+            from_foot, at_foot = _normal(u / noise)
+            from_top, at_top = _normal((u - long) / noise)
+            along = from_foot - from_top
+            if along <= 0.0:
+                continue
+            pull_v, pull_w = r * v / square + facing_v, r * w / square + facing_w
+            pull = np.sqrt(pull_v * pull_v + pull_w * pull_w)
+            bessel, ratio = _bessel(pull)
+            ratio = ratio / pull if pull > 0.0 else 0.5
+            gap = rho - r
+            exponent = pull - rho * r / square - one_sided - 0.5 * gap * gap / square
+            around = np.exp(exponent) * bessel / (2.0 * np.pi * square * at_all_sides)
+            here = weight[i] * 2.0 * np.pi * r / area * around * along
+            if here <= 0.0:
+                continue
+            density[i] += here
+            if wanted:
+                at_foot /= noise * along
+                at_top /= noise * along
+                by_u = here * (at_foot - at_top)
+                by_length = here * at_top
+                towards = ratio * (pull_v * v + pull_w * w)
+                by_half = 0.5 * here * ((towards - r) / square + 1.0 / r)
+                by_v = here * (r * ratio * pull_v - v) / square
+                by_w = here * (r * ratio * pull_w - w) / square
+                shift = change[j]
+                for c in range(k):
+                    derivative[i, c] += (
+                        by_length * shift[6, c]
+                        + by_half * (shift[7, c] + shift[8, c])
+                        - by_u * (shift[0, c] + shift[4, c] * w - shift[5, c] * v)
+                        - by_v * (shift[1, c] + shift[5, c] * u - shift[3, c] * w)
+                        - by_w * (shift[2, c] + shift[3, c] * v - shift[4, c] * u)
+                        - here * area_change[c]
                     )
-        if organ[i] != 0:
-            for j in range(m):
-                x, y, z = (
-                    points[i, 0] - leaf_origin[j, 0],
-                    points[i, 1] - leaf_origin[j, 1],
-                    points[i, 2] - leaf_origin[j, 2],
+                derivative[i, k] += here * (ratio * pull_v - mean_facing * facing_v)
+                derivative[i, k + 1] += here * (ratio * pull_w - mean_facing * facing_w)
+                derivative[i, k + 2] += here * (
+                    -2.0 + (rho * rho + r * r - 2.0 * r * towards) / square - (u * at_foot - (u - long) * at_top)
                 )
-                u = leaf_frame[j, 0, 0] * x + leaf_frame[j, 1, 0] * y + leaf_frame[j, 2, 0] * z
-                length = leaf_length[j]
-                if u < -reach or u > length + reach:
-                    continue
-                w = leaf_frame[j, 0, 2] * x + leaf_frame[j, 1, 2] * y + leaf_frame[j, 2, 2] * z
-                if w > depth or w < -depth:
-                    continue
-                v = leaf_frame[j, 0, 1] * x + leaf_frame[j, 1, 1] * y + leaf_frame[j, 2, 1] * z
-                slope = leaf_half[j + 1] - leaf_half[j]
-                if abs(v) > max(leaf_half[j], leaf_half[j + 1]) + reach:
-                    continue
-                from_start, at_start = _normal(u / leaf_noise)
-                from_end, at_end = _normal((u - length) / leaf_noise)
-                along = from_start - from_end
-                if along <= 0.0:
-                    continue
-                at_start /= leaf_noise * along
-                at_end /= leaf_noise * along
-                # the half width is taken where the point comes from on average, given u
-                pull = at_start - at_end
-                s = min(max((u + leaf_square * pull) / length, 0.0), 1.0)
-                half = leaf_half[j] + s * slope
-                right, left = half + v, half - v  # from the edges
-                until_right, at_right = _normal(right / leaf_noise)
-                until_left, at_left = _normal(left / leaf_noise)
-                across = until_right + until_left
-                if across <= 0.0:
-                    continue
-                at_right /= leaf_noise * across
-                at_left /= leaf_noise * across
-                bell = np.exp(-0.5 * (w / thickness) ** 2) / (ROOT_TWO_PI * thickness)
-                density = share[1] * seen[i] / leaf_area * bell * along * across
-                if density <= 0.0:
-                    continue
-                on_leaf += density
-                if wanted:
-                    by_v, by_half = at_right - at_left, at_right + at_left
-                    spread = u * at_start - (u - length) * at_end
-                    by_place = by_half * slope / length  # of the place where the half width is taken
-                    by_thickness = w * w / (thickness * thickness) - 1.0
-                    by_noise = (
-                        thin * by_thickness
-                        - spread
-                        + by_place
-                        * (leaf_square * pull * (1.0 + spread) + u * u * at_start - (u - length) ** 2 * at_end)
-                        - (right * at_right + left * at_left)
+
+
+@kernel
+def strip_density(
+    points, weight, origin, frame, length, half, right, left, area, noise, change, area_change, density, derivative
+):  # fmt: skip
+    """Add the density of points that come from a strip, or from one side of it, and its derivatives.
+
+    A point is uniform on the flat segments, displaced by isotropic normal noise, to which the strip's thickness adds
+    across it: the density is a normal density across the surface times differences of normal distributions along and
+    across.
+
+    Parameters
+    ----------
+    points : (n, 3)
+    weight : (n,) by which the density is multiplied at each point; where it is 0, nothing is computed
+    origin (m, 3), frame (m, 3, 3) columns tangent, lateral, normal, length (m,), half (m + 1,) : the segments, and half
+        widths at the nodes
+    right, left : how many half widths the surface reaches to either side of its midrib: 1 or 0
+    area : of the strip, as far as it was seen
+    noise : (2,) standard deviation, and what the thickness adds to that across the surface
+    change (m, 9, k), area_change (k,), density, derivative (n, k + 2) : as of :func:`tube_density`; the derivatives are
+        by the k parameters and by the logarithms of the two noises
+    """
+    wanted = derivative.shape[0] > 0
+    k = change.shape[2]
+    std, thickness = noise[0], np.hypot(noise[0], noise[1])
+    reach, depth = REACH * std, REACH * thickness
+    square = std * std
+    thin = square / (thickness * thickness)
+    for i in range(points.shape[0]):
+        if weight[i] == 0.0:
+            continue
+        for j in range(len(length)):
+            x, y, z = points[i, 0] - origin[j, 0], points[i, 1] - origin[j, 1], points[i, 2] - origin[j, 2]
+            u = frame[j, 0, 0] * x + frame[j, 1, 0] * y + frame[j, 2, 0] * z
+            long = length[j]
+            if u < -reach or u > long + reach:
+                continue
+            w = frame[j, 0, 2] * x + frame[j, 1, 2] * y + frame[j, 2, 2] * z
+            if w > depth or w < -depth:
+                continue
+            v = frame[j, 0, 1] * x + frame[j, 1, 1] * y + frame[j, 2, 1] * z
+            slope = half[j + 1] - half[j]
+            widest = max(half[j], half[j + 1])
+            if v > right * widest + reach or v < -left * widest - reach:
+                continue
+            from_start, at_start = _normal(u / std)
+            from_end, at_end = _normal((u - long) / std)
+            along = from_start - from_end
+            if along <= 0.0:
+                continue
+            at_start /= std * along
+            at_end /= std * along
+            # the half width is taken where the point comes from on average, given u
+            pull = at_start - at_end
+            s = min(max((u + square * pull) / long, 0.0), 1.0)
+            wide = half[j] + s * slope
+            to_right, to_left = right * wide - v, left * wide + v  # from the edges
+            until_right, at_right = _normal(to_right / std)
+            until_left, at_left = _normal(to_left / std)
+            across = until_right + until_left
+            if across <= 0.0:
+                continue
+            at_right /= std * across
+            at_left /= std * across
+            bell = np.exp(-0.5 * (w / thickness) ** 2) / (ROOT_TWO_PI * thickness)
+            here = weight[i] / area * bell * along * across
+            if here <= 0.0:
+                continue
+            density[i] += here
+            if wanted:
+                by_v, by_half = at_left - at_right, right * at_right + left * at_left
+                spread = u * at_start - (u - long) * at_end
+                by_place = by_half * slope / long  # of the place where the half width is taken
+                by_thickness = w * w / (thickness * thickness) - 1.0
+                by_noise = (
+                    thin * by_thickness
+                    - spread
+                    + by_place * (square * pull * (1.0 + spread) + u * u * at_start - (u - long) ** 2 * at_end)
+                    - (to_right * at_right + to_left * at_left)
+                )
+                by_u = here * (pull + by_place * (1.0 - spread - square * pull * pull))
+                by_v *= here
+                by_w = -here * w / (thickness * thickness)
+                by_length = here * (at_end - by_place * (((u - long) + square * pull) * at_end + s))
+                by_first, by_second = here * by_half * (1.0 - s), here * by_half * s
+                shift = change[j]
+                for c in range(k):
+                    derivative[i, c] += (
+                        by_length * shift[6, c]
+                        + by_first * shift[7, c]
+                        + by_second * shift[8, c]
+                        - by_u * (shift[0, c] + shift[4, c] * w - shift[5, c] * v)
+                        - by_v * (shift[1, c] + shift[5, c] * u - shift[3, c] * w)
+                        - by_w * (shift[2, c] + shift[3, c] * v - shift[4, c] * u)
+                        - here * area_change[c]
                     )
-                    by_u = density * (pull + by_place * (1.0 - spread - leaf_square * pull * pull))
-                    by_v *= density
-                    by_w = -density * w / (thickness * thickness)
-                    by_length = density * (at_end - by_place * (((u - length) + leaf_square * pull) * at_end + s))
-                    by_first, by_second = density * by_half * (1.0 - s), density * by_half * s
-                    change = leaf_change[j]
-                    for c in range(k):
-                        scores[i, c] += (
-                            by_length * change[6, c]
-                            + by_first * change[7, c]
-                            + by_second * change[8, c]
-                            - by_u * (change[0, c] + change[4, c] * w - change[5, c] * v)
-                            - by_v * (change[1, c] + change[5, c] * u - change[3, c] * w)
-                            - by_w * (change[2, c] + change[3, c] * v - change[4, c] * u)
-                        )
-                    scores[i, k + 3] += density * by_noise
-                    scores[i, k + 4] += density * (1.0 - thin) * by_thickness
-        p = floor + on_stem + on_leaf
-        log_p[i] = np.log(p)
-        if wanted:
-            for c in range(k):
-                scores[i, c] = (scores[i, c] - on_leaf * leaf_area_change[c] - on_stem * stem_area_change[c]) / p
-            for c in range(k, k + 5):
-                scores[i, c] /= p
-            scores[i, k + 5] = on_stem / p - share[0]
-            scores[i, k + 6] = floor / p - share[2]
+                derivative[i, k] += here * by_noise
+                derivative[i, k + 1] += here * (1.0 - thin) * by_thickness
+
+
+@kernel
+def add_scores(scale, derivative, columns, scores):
+    """Add derivatives (n, c) of a density, times `scale` (n,) each, to the `columns` (c,) of scores (n, k)."""
+    for i in range(len(scale)):
+        if scale[i] == 0.0:
+            continue
+        for c in range(len(columns)):
+            scores[i, columns[c]] += scale[i] * derivative[i, c]
 
 
 @kernel
