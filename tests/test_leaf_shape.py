@@ -14,15 +14,15 @@ ROTATION = 1e-9  # frames are products of three rotations
 QUARTER = 0.03  # of the greatest: the wave's extreme lies at 0.21 of the midrib, not at 0.25
 
 NAMES = Phytomer.PARAMETERS
-LOW_SHAPE = [-80.0, -60.0, -90.0, -270.0, 0.1, 0.05, 0.3, 0.5, -30.0, 1.0, -0.02]
-HIGH_SHAPE = [80.0, 60.0, 90.0, 270.0, 1.3, 0.9, 6.0, 1.5, 40.0, 4.0, 0.02]
+LOW_SHAPE = [-80.0, -60.0, -90.0, -270.0, 0.1, 0.05, 0.3, 0.5, -30.0, 1.0, -0.02, -60.0]
+HIGH_SHAPE = [80.0, 60.0, 90.0, 270.0, 1.3, 0.9, 6.0, 1.5, 40.0, 4.0, 0.02, 60.0]
 X = np.array(
-    [3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0, 0.0, 1.0, 0.0]
+    [3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0, 0.0, 1.0, 0.0, 0.0]
 )
 LOW = np.array([*[0.5, 2.0, 5.0, 10.0, 1.0, -6.0, 0.1, 0.0, -40.0, -20.0], *LOW_SHAPE])
 HIGH = np.array([*[5.0, 25.0, 150.0, 80.0, 9.0, 6.0, 20.0, 1.5, 40.0, 20.0], *HIGH_SHAPE])
 
-SHAPES = arrays(np.float64, (21,), elements=st.floats(0, 1), fill=st.nothing()).map(lambda u: LOW + u * (HIGH - LOW))
+SHAPES = arrays(np.float64, (22,), elements=st.floats(0, 1), fill=st.nothing()).map(lambda u: LOW + u * (HIGH - LOW))
 
 
 def grow(x, **constants):
@@ -68,13 +68,13 @@ def assert_same(organs, others, atol):
 
 def test_neutral_values_are_those_of_the_constants():
     neutral = Phytomer(widest_share=0.3, concavity=1.5).neutral
-    assert neutral.shape == (len(NAMES),) == (21,)
-    assert len(Phytomer.UNITS) == 21
+    assert neutral.shape == (len(NAMES),) == (22,)
+    assert len(Phytomer.UNITS) == 22
     assert np.all(np.isnan(neutral[:6]))  # the paper's have none
-    np.testing.assert_array_equal(neutral[6:], [0.0] * 8 + [1.0, 0.3, 1.5, 1.0, 0.0, 1.0, 0.0])
+    np.testing.assert_array_equal(neutral[6:], [0.0] * 8 + [1.0, 0.3, 1.5, 1.0, 0.0, 1.0, 0.0, 0.0])
 
 
-@given(SHAPES, st.integers(6, 21), st.sampled_from([0.3, 0.5, 0.62]), st.floats(1.0, 3.0))
+@given(SHAPES, st.integers(6, 22), st.sampled_from([0.3, 0.5, 0.62]), st.floats(1.0, 3.0))
 def test_neutral_values_give_the_papers_organs(x, given_parameters, widest, concavity):
     """However many of them are left out."""
     constants = {"widest_share": widest, "concavity": concavity}
@@ -116,7 +116,7 @@ def test_widths_are_those_of_a_leaf(x):
     np.testing.assert_allclose(leaf.half_width[0], half * base, rtol=1e-9)
 
 
-@given(arrays(np.float64, (4, 21), elements=st.floats(0, 1)).map(lambda u: LOW + u * (HIGH - LOW)))
+@given(arrays(np.float64, (4, 22), elements=st.floats(0, 1)).map(lambda u: LOW + u * (HIGH - LOW)))
 def test_a_population_is_its_plants_one_by_one(xs):
     stem, leaf = Phytomer().organs(xs)
     for i, x in enumerate(xs):
@@ -135,6 +135,7 @@ def test_upside_down_is_the_same_plant(x):
     np.testing.assert_allclose(leaf.half_width, expected_leaf.half_width, atol=EXACT)
     np.testing.assert_allclose(leaf.frame[:, :, 0], expected_leaf.frame[:, :, 0], atol=ROTATION)
     np.testing.assert_allclose(leaf.frame[:, :, 1:], -expected_leaf.frame[:, :, 1:], atol=ROTATION)  # seen from below
+    assert leaf.fold == -expected_leaf.fold
     np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=EXACT)
     np.testing.assert_allclose(np.linalg.det(pose), 1.0, rtol=EXACT)
     again, back, pose_back = Phytomer().upside_down(twin)
@@ -142,7 +143,7 @@ def test_upside_down_is_the_same_plant(x):
     np.testing.assert_allclose(pose @ pose_back, np.eye(4), atol=1e-9)
 
 
-@pytest.mark.parametrize("k", range(7, 22))
+@pytest.mark.parametrize("k", range(7, 23))
 def test_upside_down_with_any_number_of_parameters(k):
     """As with all of them, and the others neutral."""
     x = X.copy()

@@ -2,6 +2,8 @@
 
 import copy
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from phytofit.engine.visibility import Hidden
 from phytofit.engine.voids import Void
 from phytofit.models import LEAF, STEM, Organ, Phytomer, SurfaceSampler, move
 from phytofit.models.organs import frames_along
+from phytofit.parameters import Parameter, ParameterSpace
 from phytofit.species import load_species
 
 EXACT = 1e-9  # relative; sums in float64
@@ -31,12 +34,41 @@ SUMMED = 5e-3  # of the same, for the sum over all points: the tube's Bessel rat
 STEP = 1e-6  # of a prior's spread, or radians, cm or nats: few pieces come into reach over it, with a small jump
 CLEAR = 10.0  # nats; an error so much larger is no accident
 
-SPECIES = load_species()
+SORGHUM = load_species()
+FOLD = Parameter("leaf_fold", "deg", 0.0, 15.0, -70.0, 70.0)  # which no species has that comes with phytofit
+SPECIES = replace(
+    SORGHUM,
+    space=ParameterSpace([*SORGHUM.space.parameters, FOLD]),
+    ranges=np.vstack([SORGHUM.ranges, [0.0, 0.0]]),
+)
 N = len(SPECIES.space)
-NEUTRAL = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0, 0.0, 1.0, 0.0]
+NEUTRAL = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.5, 2.0, 1.0, 0.0, 1.0, 0.0, 0.0]
 X = np.array([3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, *NEUTRAL])
 SHAPED = np.array(
-    [3.2, 14.0, 42.0, 54.0, 6.5, 3.4, 5.0, 0.8, 9.0, -5.0, 25.0, 7.0, 10.0, 60.0, 0.6, 0.42, 1.6, 0.8, 8.0, 1.7, 0.03]
+    [
+        3.2,
+        14.0,
+        42.0,
+        54.0,
+        6.5,
+        3.4,
+        5.0,
+        0.8,
+        9.0,
+        -5.0,
+        25.0,
+        7.0,
+        10.0,
+        60.0,
+        0.6,
+        0.42,
+        1.6,
+        0.8,
+        8.0,
+        1.7,
+        0.03,
+        14.0,
+    ]
 )
 LOW = np.array(
     [
@@ -61,6 +93,7 @@ LOW = np.array(
         -15.0,
         1.1,
         -0.03,
+        -30.0,
     ]
 )
 HIGH = np.array(
@@ -86,6 +119,7 @@ HIGH = np.array(
         20.0,
         3.0,
         0.02,
+        40.0,
     ]
 )
 
@@ -125,7 +159,10 @@ def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0
     segments = stem.axis[:-1], stem.frame, stem.segment_lengths, radius
     tube = Tube(none, *segments, float(around), facing, noise[0], *unchanged)
     area = leaf.segment_lengths @ (leaf.half_width[1:] + leaf.half_width[:-1])
-    sides = (Side(leaf.frame, 1.0, 1.0, np.zeros((len(leaf.frame), 9, 0))),)
+    none_changed = np.zeros((len(leaf.frame), 9, 0))
+    sides = (Side(leaf.frame, 1.0, 1.0, none_changed),)
+    if leaf.fold:
+        sides = tuple(Side(half_frame(leaf, s), 0.5 + 0.5 * s, 0.5 - 0.5 * s, none_changed) for s in (1, -1))
     strip = Strip(
         none,
         leaf.axis[:-1],
@@ -140,6 +177,12 @@ def density(points, organs, noise, *, share=(0.3, 0.6, 0.1), outlier_density=0.0
     weights = [np.full(len(points), float(organ != other)) for other in (1, 0)]
     with np.errstate(divide="ignore", invalid="ignore"):  # where there is nothing, not even an outlier
         return np.exp(mixture.evaluate(np.array(points, float), weights, 0, derivatives=False).log_p)
+
+
+def half_frame(leaf, side):
+    """Frames (m, 3, 3) of the half of a leaf to one side of its fold: turned about the midrib, up on either side."""
+    turned = Rotation.from_euler("x", side * leaf.fold, degrees=True).as_matrix()
+    return leaf.frame @ turned
 
 
 def gauss(low, high, noise):
@@ -161,10 +204,12 @@ def over_leaf(points, leaf, noise, thickness=0.0):
     """Density of noisy points of a leaf, by quadrature over all its patches."""
     across = np.hypot(noise, thickness)
     total, area = np.zeros(len(points)), 0.0
-    for j, frame in enumerate(leaf.frame):
+    for j, side in product(range(len(leaf.frame)), (1, -1)):
+        frame = half_frame(leaf, side)[j]
         s, along = gauss(0.0, leaf.segment_lengths[j], noise)
         start, end = leaf.half_width[j], leaf.half_width[j + 1]
-        t, sideways = gauss(-1.0, 1.0, noise / max(start, end))
+        t, sideways = gauss(0.0, 1.0, noise / max(start, end))
+        t = side * t
         half = start + (end - start) * s / leaf.segment_lengths[j]
         weights = np.outer(along * half, sideways).ravel()
         local = np.stack([np.repeat(s, len(t)), np.outer(half, t).ravel(), np.zeros(len(weights))], axis=1)
@@ -460,9 +505,9 @@ def test_the_likelihood_of_a_state_is_the_density_of_its_organs(cut):
         theta = state.theta.copy()
         theta[N] = 0.8  # 24 of 30 pieces
         state = at(state, theta)
-        leaf = Organ(LEAF, leaf.axis[:25], leaf.frame[:24], leaf.half_width[:25])
+        leaf = Organ(LEAF, leaf.axis[:25], leaf.frame[:24], leaf.half_width[:25], leaf.fold)
     organs = [
-        Organ(o.kind, *(np.ascontiguousarray(a) for a in (o.axis, o.frame, o.half_width)))
+        Organ(o.kind, *(np.ascontiguousarray(a) for a in (o.axis, o.frame, o.half_width)), o.fold)
         for o in move([stem, leaf], likelihood.pose_of(state))
     ]
     for organ in (-1, 0, 1):

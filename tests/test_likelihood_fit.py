@@ -123,7 +123,7 @@ def test_a_leaf_that_no_paper_draws_is_fitted_with_more_parameters():
     }
     real = phytofit.simulate(fixed=GENTLE | shape, n_points=N_POINTS, noise_cm=0.3, seed=5)
     found = phytofit.fit(real.points, "cm", up=real.pose[:3, 2], threads=2)
-    assert len(found.x) == len(phytofit.models.Phytomer.PARAMETERS)
+    assert len(found.x) == len(phytofit.load_species().space)
     names = phytofit.models.Phytomer.PARAMETERS
     for name, value in shape.items():
         i = names.index(name)

@@ -71,7 +71,7 @@ def fitted():
 def bent(fitted):
     """The same, as one of the leaves that bend and twist; its errors are independent."""
     species = phytofit.load_species()
-    x = np.where(np.isnan(species.model.neutral), 0.0, species.model.neutral)
+    x = species.model.neutral[: len(species.space)]
     x[: len(fitted.x)] = fitted.x
     return replace(fitted, species=species, x=x, trait_covariance=0.01 * np.eye(len(x)))
 

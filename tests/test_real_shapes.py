@@ -19,7 +19,7 @@ GENTLE = {"leaf_length": 55.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diam
 REAL = {"leaf_base_width": 0.5, "leaf_widest_at": 0.4, "leaf_bow": 10.0}
 WITHIN_STD = 4.0  # standard errors: one in 16,000 is further off
 SPECIES = phytofit.load_species()
-NAMES = phytofit.models.Phytomer.PARAMETERS
+NAMES = SPECIES.space.names
 
 
 def grown(seed=5, n_points=2500, noise_cm=0.3, **fixed):

@@ -16,6 +16,7 @@ from phytofit.engine.posterior import Posterior
 from phytofit.engine.sighting import across_leaf
 from phytofit.kernels.neighbors import sum_by_distance
 from phytofit.models import Organ, move
+from phytofit.models.surface import on_strip
 
 __all__ = ["Dependence", "score_dependence", "width_misfit"]
 
@@ -178,9 +179,8 @@ def width_misfit(posterior: Posterior, state: State, at: Evaluation, bell: Bell)
 def _local(organs: tuple[Organ, ...], points: FloatArray, on_stem: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """Frames (n, 3, 3), columns along, across, normal, of the surface near each point, and distances (n,) from it."""
     stem, leaf = organs
-    piece, _ = leaf.nearest(points)
-    frame = leaf.frame[piece]
-    distance = np.einsum("ni,ni->n", points - leaf.axis[piece], frame[:, :, 2])
+    by = on_strip(leaf, points)
+    frame, distance = by.frame, by.off
     axis = stem.frame[0, :, 0]
     radial = points[on_stem] - stem.axis[0]
     height, nodes = radial @ axis, np.concatenate([[0.0], np.cumsum(stem.segment_lengths)])

@@ -11,6 +11,7 @@ from phytofit.engine.mixture import Evaluation
 from phytofit.engine.posterior import Posterior
 from phytofit.engine.sighting import across_leaf
 from phytofit.models import move
+from phytofit.models.surface import places_on_strip
 
 __all__ = ["MISFIT", "Ending", "PointsEnd", "combined", "ending", "points_end"]
 
@@ -153,9 +154,8 @@ def _seen_along(posterior: Posterior, state: State, at: FloatArray) -> FloatArra
     leaf = move([posterior.model.organs(state.x)[1].row(0)], posterior.pose_of(state))[0]
     nodes = np.append(0.0, np.cumsum(leaf.segment_lengths))
     piece = np.clip(np.searchsorted(nodes, at) - 1, 0, len(leaf.frame) - 1)
-    middle = leaf.axis[piece] + (at - nodes[piece])[:, np.newaxis] * leaf.frame[piece][:, :, 0]
     half = np.interp(at, nodes, leaf.half_width)
-    across = [middle + (share * half)[:, np.newaxis] * leaf.frame[piece][:, :, 1] for share in ACROSS]
+    across = [places_on_strip(leaf, piece, at - nodes[piece], share * half) for share in ACROSS]
     hidden = np.mean([posterior.hidden.around(places) for places in across], axis=0)
     seen: FloatArray = np.maximum(1.0 - hidden, LEAST_SEEN)
     return seen

@@ -1,7 +1,7 @@
 """The log posterior of a phytomer in a cloud: each point of the stem, of the leaf, or an outlier."""
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
@@ -18,12 +18,14 @@ from phytofit.engine.visibility import N_STRIPS, Hidden, cells
 from phytofit.engine.voids import Void, around_stem, facing_share
 from phytofit.kernels.likelihood import CHANGES, segment_changes
 from phytofit.models import Organ, Phytomer
+from phytofit.models.surface import side_frames
 from phytofit.parameters import ParameterSpace
 from phytofit.species import Species
 
 __all__ = ["Posterior"]
 
 FloatArray = NDArray[np.float64]
+FOLD = "leaf_fold"  # the parameter of a blade that is folded along its midrib
 STEP = 1e-4  # of a prior's spread, for the derivatives of the organs
 POSE_STEP = 1e-4  # cm and radians, for those of the area that was seen
 
@@ -96,7 +98,10 @@ class Posterior:
         k = len(state.layout.parameters)
         theta = np.concatenate([state.x, prior.mean[k : len(layout.parameters)], state.theta[k:]])
         extended = replace(state, theta=theta, layout=layout)
-        return extended.changed(leaf_thickness=max(state["leaf_thickness"], prior.mean[layout.place("leaf_thickness")]))
+        i = layout.place("leaf_thickness")
+        if prior.lower[i] <= theta[i] <= prior.upper[i]:
+            return extended
+        return extended.changed(leaf_thickness=prior.mean[i])
 
     def at(self, points: FloatArray) -> "Posterior":
         """The same posterior, of points that have moved."""
@@ -215,7 +220,10 @@ class Posterior:
             origin=leaf.axis[0, :-1] @ r.T + t,
             length=length[0],
             half=half[0],
-            sides=(Side(r @ leaf.frame[0], 1.0, 1.0, changes(leaf, leaf.frame, length, half)),),
+            sides=tuple(
+                Side(r @ frame[0], right, left, changes(leaf, frame, length, half))
+                for frame, right, left in self._sides(leaf)
+            ),
             area=leaf_area,
             noise=state.noise[1:],
             area_change=leaf_area_change,
@@ -223,6 +231,15 @@ class Posterior:
         background = np.full(len(self.points), self.outlier_density)
         shares = np.array([layout.place("stem_share"), -1, layout.place("outlier_share")])
         return Mixture((tube, strip), state.share, shares, background)
+
+    def _sides(self, leaf: Organ) -> Iterator[tuple[FloatArray, float, float]]:
+        """Frames of what lies on either side of a leaf's fold, and how many half widths that reaches to the right and
+        left; of a leaf that can't be folded, of all of it."""
+        if FOLD not in self.prior.layout or not self.prior.free[self.prior.layout.place(FOLD)]:
+            yield leaf.frame, 1.0, 1.0
+            return
+        for right, left in ((1.0, 0.0), (0.0, 1.0)):
+            yield side_frames(leaf, right - left), right, left
 
     def _leaf_area(
         self, leaf: Organ, length: FloatArray, half: FloatArray, state: State, steps: FloatArray
@@ -237,9 +254,7 @@ class Posterior:
         if self.hidden is None:
             return _log_change(whole.sum(axis=1), steps)
         whole = np.repeat(whole[..., np.newaxis] / N_STRIPS, N_STRIPS, axis=2)
-        return self._seen_area(
-            cells(leaf.axis, leaf.frame, length, middle), whole, self.hidden.around_cells, state, steps
-        )
+        return self._seen_area(cells(leaf, length, middle), whole, self.hidden.around_cells, state, steps)
 
     def _stem_area(self, stem: Organ, state: State, steps: FloatArray) -> tuple[float, FloatArray]:
         """The same of the stem."""
@@ -268,18 +283,32 @@ class Posterior:
         steps: FloatArray,
     ) -> tuple[float, FloatArray]:
         """What is seen of a population's areas (c, ...) around places (c, ..., 3), in the model's frame, of which a
-        share is `hidden`; and the change (c + 6,) of its logarithm."""
+        share is `hidden`; and the change (c + 6,) of its logarithm.
+
+        Only the first plant's places are looked at, and a little beside them: how the others change what is seen
+        follows from the slope of `hidden` there.
+        """
         pose = self.pose_of(state)
-        places = places @ pose[:3, :3].T + pose[:3, 3]
+        r = pose[:3, :3]
+        there = places[0] @ r.T + pose[:3, 3]
+        seen = 1.0 - hidden(there[np.newaxis])[0]
+        area = float(np.sum(whole[0] * seen))
+        n = len(steps)
+        if not n:
+            return area, np.zeros(0)
+        beside = POSE_STEP * np.concatenate([np.eye(3), -np.eye(3)]).reshape(6, *[1] * (there.ndim - 1), 3)
+        high, low = hidden(there + beside).reshape(2, 3, *seen.shape)
+        lost = whole[0] * (high - low) / (2.0 * POSE_STEP)  # (3, ...) by a move along each axis of the cloud's frame
         rest = tuple(range(1, whole.ndim))
-        area, change = _log_change(np.sum(whole * (1.0 - hidden(places)), axis=rest), steps)
-        if len(steps):
-            arm = places[0] - state.center - state.shift
-            turned = [np.cross(axis, arm) for axis in _left_jacobian(state.turn).T]
-            moves = POSE_STEP * np.array([*turned, *(np.broadcast_to(axis, arm.shape) for axis in np.eye(3))])
-            share = np.sum(whole[0] * hidden(np.concatenate([places[0] + moves, places[0] - moves])), axis=rest)
-            change[-6:] = (share[6:] - share[:6]) / (2.0 * POSE_STEP * area)
-        return area, change
+        twice = 2.0 * steps.reshape(-1, *[1] * (whole.ndim - 1))
+        larger = np.sum((whole[1 : n + 1] - whole[n + 1 :]) / twice * seen, axis=rest)
+        moved = (places[1 : n + 1] - places[n + 1 :]) / twice[..., np.newaxis]
+        in_frame = np.tensordot(r, lost, axes=(0, 0))  # by a move along each axis of the model's
+        by_parameters = larger - moved.reshape(n, -1) @ np.moveaxis(in_frame, 0, -1).ravel()
+        arm = there - state.center - state.shift
+        turned = [np.sum(np.moveaxis(np.cross(axis, arm), -1, 0) * lost) for axis in _left_jacobian(state.turn).T]
+        by_pose = -np.array([*turned, *lost.reshape(3, -1).sum(axis=1)])
+        return area, np.concatenate([by_parameters, by_pose]) / area
 
 
 def _volume(points: FloatArray) -> float:

@@ -27,7 +27,7 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 FEW_POINTS = 1250  # with which a refinement begins, and which decide from where a richer leaf is begun
-COARSE_TOLERANCE = 1.0  # nats; it is refined with all points afterwards
+COARSE_TOLERANCE, FINE_TOLERANCE = 1.0, 3e-3  # nats; the one where it is refined further afterwards
 HOLE_ROUNDS = 3  # in which a fit and the holes that it leaves in the leaf come to agree
 SAME_SHARE = 0.05
 
@@ -93,6 +93,7 @@ def optimum_near(
     cut: bool = False,
     hidden: Hidden | None = None,
     with_void: bool = False,
+    tolerance: float = FINE_TOLERANCE,
 ) -> Optimum:
     """Where the state leads to; `hidden` is what is known before of what was not seen.
 
@@ -105,7 +106,7 @@ def optimum_near(
         if number == 0 and len(cloud.points) >= 2 * FEW_POINTS:
             few = cloud.part(FEW_POINTS).posterior(species, thick=thick, cut=cut, hidden=hidden)
             state = state.at(refinement(few, state, tolerance=COARSE_TOLERANCE).theta)
-        end = refinement(posterior, state)
+        end = refinement(posterior, state, tolerance=tolerance)
         state = state.at(end.theta)
         at = posterior.evaluate(state)
         hidden = find_holes(posterior, state, at, with_void=with_void)

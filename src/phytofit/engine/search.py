@@ -49,6 +49,7 @@ OF_START = (OFFSET, "leaf_base_bend", "leaf_angle")  # beyond its first twentiet
 RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
 RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
 LOWER_ROUNDS = 3
+
 LEAST_FACING = 1.0  # concentration, from which a stem was seen from one side: a half of it has 1.6
 
 
@@ -138,15 +139,15 @@ def _rich(species: Species, cloud: Cloud, simple: Optimum) -> tuple[Optimum, Opt
     richer = part.posterior(species, thick=True, hidden=known)
     extended = richer.extended(simple.state)
     starts = [extended, *turned_blade(Optimum(richer, extended, richer.evaluate(extended), converged=False))]
-    best = max((optimum_near(species, it, part, thick=True, hidden=known) for it in starts), key=_log_likelihood)
+    coarse = partial(optimum_near, species, thick=True, tolerance=COARSE_TOLERANCE)
+    best = max((coarse(it, part, hidden=known) for it in starts), key=_log_likelihood)
     best = _restarted(species, part, best, LOWER_ROUNDS)
-    best = optimum_near(species, best.state, cloud, thick=True, hidden=best.posterior.hidden, with_void=True)
+    best = coarse(best.state, cloud, hidden=best.posterior.hidden, with_void=True)
     best = _restarted(species, cloud, best, 1)
+    best = optimum_near(species, best.state, cloud, thick=True, hidden=best.posterior.hidden)
     hidden = best.posterior.hidden
     starts = [_cut(best.state, share) for share in CUT_SHARES]
-    cut = max(
-        (optimum_near(species, it, part, thick=True, cut=True, hidden=hidden) for it in starts), key=_log_likelihood
-    )
+    cut = max((coarse(it, part, cut=True, hidden=hidden) for it in starts), key=_log_likelihood)
     return best, optimum_near(species, cut.state, cloud, thick=True, cut=True, hidden=cut.posterior.hidden)
 
 
@@ -170,7 +171,8 @@ def _restarted(species: Species, cloud: Cloud, best: Optimum, rounds: int) -> Op
 def _better(species: Species, cloud: Cloud, best: Optimum, restart: Callable[[Optimum], Iterable[State]]) -> Optimum:
     """Of the best so far and the optima of a restart, that which clearly fits better."""
     for state in restart(best):
-        optimum = optimum_near(species, state, cloud, thick=True, hidden=best.posterior.hidden)
+        hidden = best.posterior.hidden
+        optimum = optimum_near(species, state, cloud, thick=True, hidden=hidden, tolerance=COARSE_TOLERANCE)
         if optimum.log_likelihood > best.log_likelihood + CLEARLY_BETTER:
             best = optimum
     return best

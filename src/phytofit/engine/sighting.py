@@ -11,6 +11,7 @@ from phytofit.engine.mixture import Evaluation
 from phytofit.engine.posterior import Posterior
 from phytofit.engine.unexplained import on_something_else
 from phytofit.models import LEAF, Organ, move
+from phytofit.models.surface import on_strip
 from phytofit.traits import measure
 
 __all__ = [
@@ -153,11 +154,11 @@ def _upper_spread(values: FloatArray) -> float:
 
 def strip_of(leaf: Organ, points: FloatArray, n_strips: int) -> NDArray[np.intp]:
     """Strip (n,) of the blade that is nearest to each point, from its right edge."""
-    j, along = leaf.nearest(points)
-    lateral = np.einsum("ni,ni->n", points - leaf.axis[j], leaf.frame[j][:, :, 1])
+    by = on_strip(leaf, points)
+    j = by.segment
     slope = (leaf.half_width[j + 1] - leaf.half_width[j]) / leaf.segment_lengths[j]
-    half = np.maximum(leaf.half_width[j] + slope * along, 1e-9)
-    strip: NDArray[np.intp] = np.clip((lateral / half + 1.0) * n_strips / 2.0, 0, n_strips - 1).astype(np.intp)
+    half = np.maximum(leaf.half_width[j] + slope * by.along, 1e-9)
+    strip: NDArray[np.intp] = np.clip((by.across / half + 1.0) * n_strips / 2.0, 0, n_strips - 1).astype(np.intp)
     return strip
 
 
@@ -188,12 +189,13 @@ def across_leaf(posterior: Posterior, state: State, *, until: float | None = Non
     leaf = posterior.model.organs(state.x)[1].row(0)
     whole = leaf.segment_lengths.sum()
     leaf = leaf if until is None else leaf.until(until)
-    j, along = leaf.nearest(points)
-    there = np.einsum("nib,ni->nb", leaf.frame[j], points - leaf.axis[j])
+    by = on_strip(leaf, points)
+    along, j = by.along, by.segment
     if until is not None:
-        along = np.where(j == len(leaf.frame) - 1, there[:, 0], along)
+        straight = np.einsum("ni,ni->n", leaf.frame[j][:, :, 0], points - leaf.axis[j])
+        along = np.where(j == len(leaf.frame) - 1, straight, along)
     place = (np.concatenate([[0.0], np.cumsum(leaf.segment_lengths)])[j] + along) / whole
-    return place, there[:, 1:]
+    return place, np.stack([by.across, by.off], axis=1)
 
 
 def _area_share(leaf: Organ, points: FloatArray) -> FloatArray:

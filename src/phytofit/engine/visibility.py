@@ -9,6 +9,7 @@ from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from phytofit.engine.voids import PARTS, Void
 from phytofit.models import Organ
+from phytofit.models.surface import on_strip, side_frames
 
 __all__ = ["N_STRIPS", "Hidden", "cells"]
 
@@ -49,8 +50,16 @@ class Hidden:
         """(m, 9, 3) of the cells."""
         leaf = self.leaf
         lengths, middle = leaf.segment_lengths[np.newaxis], self._middle[np.newaxis]
-        centers: FloatArray = cells(leaf.axis[np.newaxis], leaf.frame[np.newaxis], lengths, middle)[0]
+        centers: FloatArray = cells(leaf.as_population, lengths, middle)[0]
         return centers
+
+    @cached_property
+    def _lateral(self) -> FloatArray:
+        """(m, 9, 3) directions across the blade in the cells."""
+        right, left = (side_frames(self.leaf, side)[:, :, 1] for side in (1.0, -1.0))
+        of_strip = np.arange(N_STRIPS) >= N_STRIPS // 2
+        lateral: FloatArray = np.where(of_strip[:, np.newaxis], right[:, np.newaxis], left[:, np.newaxis])
+        return lateral
 
     @cached_property
     def _long(self) -> FloatArray:
@@ -65,9 +74,9 @@ class Hidden:
     def around_cells(self, places: FloatArray) -> FloatArray:
         """Share (n, m, 9) not seen of points at places (n, m, 9, 3), each near the centre of its cell."""
         offset = places - self._centers
-        tangent, lateral = self.leaf.frame[:, :, 0], self.leaf.frame[:, :, 1]
+        tangent = self.leaf.frame[:, :, 0]
         along = np.einsum("nmbi,mi->nmb", offset, tangent) / self._long[:, np.newaxis]
-        across = np.einsum("nmbi,mi->nmb", offset, lateral) / self._wide[:, np.newaxis]
+        across = np.einsum("nmbi,mbi->nmb", offset, self._lateral) / self._wide[:, np.newaxis]
         share = self._at(along + np.arange(len(self.share))[:, np.newaxis], across + np.arange(N_STRIPS))
         if self.void is None:
             return share
@@ -80,9 +89,11 @@ class Hidden:
     def at(self, points: FloatArray) -> FloatArray:
         """Share (n,) not seen of the leaf's points where these (n, 3) lie; a void takes all points alike, those of no
         organ as well, and has no part in it."""
-        piece, along = self.leaf.nearest(points)
-        across = np.einsum("ni,ni->n", points - self.leaf.axis[piece], self.leaf.frame[piece][:, :, 1])
-        return self._at(piece + along / self._long[piece] - 0.5, across / self._wide[piece] + 0.5 * (N_STRIPS - 1))
+        by = on_strip(self.leaf, points)
+        piece = by.segment
+        return self._at(
+            piece + by.along / self._long[piece] - 0.5, by.across / self._wide[piece] + 0.5 * (N_STRIPS - 1)
+        )
 
     def around(self, places: FloatArray) -> FloatArray:
         """Share (n,) not seen of the leaf's points from places (n, 3) on it, by holes and void."""
@@ -107,11 +118,13 @@ class Hidden:
         return found
 
 
-def cells(axis: FloatArray, frame: FloatArray, length: FloatArray, middle: FloatArray) -> FloatArray:
-    """Centres (n, m, 9, 3) of the cells of leaves: midribs (n, m + 1, 3), frames (n, m, 3, 3), lengths and half widths
-    in the middle (n, m) of the pieces."""
+def cells(leaf: Organ, length: FloatArray, middle: FloatArray) -> FloatArray:
+    """Centres (n, m, 9, 3) of the cells of a population's leaves: lengths and half widths in the middle (n, m) of the
+    pieces."""
     place = (2.0 * np.arange(N_STRIPS) + 1.0) / N_STRIPS - 1.0
     across = middle[..., np.newaxis] * place
-    along = axis[:, :-1] + 0.5 * length[..., np.newaxis] * frame[..., 0]
-    centers: FloatArray = along[:, :, np.newaxis] + across[..., np.newaxis] * frame[:, :, np.newaxis, :, 1]
+    along = leaf.axis[:, :-1] + 0.5 * length[..., np.newaxis] * leaf.frame[..., 0]
+    right, left = (side_frames(leaf, side)[:, :, np.newaxis, :, 1] for side in (1.0, -1.0))
+    lateral = np.where(place[:, np.newaxis] >= 0.0, right, left)
+    centers: FloatArray = along[:, :, np.newaxis] + across[..., np.newaxis] * lateral
     return centers

@@ -9,6 +9,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import ndtr
 
 from phytofit.models import Organ
+from phytofit.models.surface import places_on_strip
 
 __all__ = ["PARTS", "Void", "around_stem", "facing_share", "find_void"]
 
@@ -119,7 +120,8 @@ def _across_leaf(leaf: Organ) -> tuple[FloatArray, FloatArray]:
     piece = np.minimum(np.searchsorted(before, s, side="right") - 1, len(long) - 1)
     half = np.interp(s, before, leaf.half_width)
     across = (2.0 * np.arange(N_ACROSS) + 1.0) / N_ACROSS - 1.0
-    middle = leaf.axis[piece] + (s - before[piece])[:, np.newaxis] * leaf.frame[piece, :, 0]
-    aside = (half[:, np.newaxis] * across)[..., np.newaxis] * leaf.frame[piece, :, 1][:, np.newaxis]
+    shape = len(s), N_ACROSS
+    segment, along = (np.broadcast_to(it[:, np.newaxis], shape) for it in (piece, s - before[piece]))
+    places = places_on_strip(leaf, segment, along, half[:, np.newaxis] * across)
     whole = float(np.sum(long * (leaf.half_width[1:] + leaf.half_width[:-1])))
-    return (middle[:, np.newaxis] + aside).reshape(-1, 3), np.repeat(2.0 * STEP_CM * half / whole / N_ACROSS, N_ACROSS)
+    return places.reshape(-1, 3), np.repeat(2.0 * STEP_CM * half / whole / N_ACROSS, N_ACROSS)

@@ -19,7 +19,7 @@ def _slant(axis, half_width, j, tube):
 
 
 @kernel
-def sample_surfaces(axis, frame, half_width, first, tube, along, across, cosine, sine, out, label):
+def sample_surfaces(axis, frame, half_width, first, tube, fold, along, across, cosine, sine, out, label):
     """Map fixed random numbers to points on the surfaces of the organs, uniformly by area (Fig. 5d).
 
     Parameters
@@ -29,6 +29,7 @@ def sample_surfaces(axis, frame, half_width, first, tube, along, across, cosine,
     half_width : (m,) at the nodes
     first : (o + 1,) where each organ's nodes begin
     tube : (o,) True for a tube (full turn), False for a strip (flat across)
+    fold : (o,) angle, radians, by which each half of a strip is raised
     along : (n,) in [0, 1), ascending: share of the whole area passed
     across : (n,) in [-1, 1): place across a strip
     cosine, sine : (n,) of the angle around a tube
@@ -67,7 +68,7 @@ def sample_surfaces(axis, frame, half_width, first, tube, along, across, cosine,
                 if tube[o]:
                     lateral, normal = w * cosine[i], w * sine[i]
                 else:
-                    lateral, normal = w * across[i], 0.0
+                    lateral, normal = w * across[i] * np.cos(fold[o]), w * abs(across[i]) * np.sin(fold[o])
                 for a in range(3):
                     out[a, i] = np.float32(
                         axis[j, a]

@@ -5,7 +5,7 @@ population of plants at once.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -30,22 +30,26 @@ class Organ:
 
     ``kind`` is `STEM` or `LEAF`; ``axis`` (..., m, 3) are the nodes from base to tip, cm; ``frame``
     (..., m - 1, 3, 3) has for each segment the columns tangent, lateral, normal; ``half_width`` (..., m) at the
-    nodes, cm: a stem's radius, half a leaf's width.
+    nodes, cm: a stem's radius, half a leaf's width.  ``fold`` (...) says by how many degrees each half of a leaf is
+    raised along its midrib, to a V; 0 is flat.
     """
 
     kind: str
     axis: FloatArray
     frame: FloatArray
     half_width: FloatArray
+    fold: FloatArray | float = 0.0
 
     def row(self, i: int) -> "Organ":
         """The organ of plant i of a population."""
-        return Organ(self.kind, self.axis[i], self.frame[i], self.half_width[i])
+        fold = self.fold[i] if isinstance(self.fold, np.ndarray) else self.fold
+        return Organ(self.kind, self.axis[i], self.frame[i], self.half_width[i], fold)
 
     @property
     def as_population(self) -> "Organ":
         """One organ, as that of a population of one plant."""
-        return Organ(self.kind, self.axis[np.newaxis], self.frame[np.newaxis], self.half_width[np.newaxis])
+        arrays = self.axis[np.newaxis], self.frame[np.newaxis], self.half_width[np.newaxis]
+        return Organ(self.kind, *arrays, np.array([self.fold]))
 
     @property
     def segment_lengths(self) -> FloatArray:
@@ -67,7 +71,7 @@ class Organ:
         m = min(max(1, int(np.searchsorted(before, (1.0 - ROUNDING) * end))), len(self.frame))  # nodes that stay
         tip = self.axis[m - 1] + (end - before[m - 1]) * self.frame[m - 1, :, 0]
         half_width = np.append(self.half_width[:m], np.interp(end, before, self.half_width))
-        return Organ(self.kind, np.vstack([self.axis[:m], tip]), self.frame[:m], half_width)
+        return Organ(self.kind, np.vstack([self.axis[:m], tip]), self.frame[:m], half_width, self.fold)
 
     @property
     def area(self) -> FloatArray:
@@ -95,7 +99,7 @@ def frames_along(axis: FloatArray, lateral: FloatArray) -> FloatArray:
 def move(organs: Sequence[Organ], pose: FloatArray) -> tuple[Organ, ...]:
     """The organs moved by a rigid pose (4, 4)."""
     r, t = pose[:3, :3], pose[:3, 3]
-    return tuple(Organ(o.kind, o.axis @ r.T + t, r @ o.frame, o.half_width) for o in organs)
+    return tuple(replace(o, axis=o.axis @ r.T + t, frame=r @ o.frame) for o in organs)
 
 
 class SurfaceSampler:
@@ -139,6 +143,8 @@ class PopulationSurfaces:
         self._half_width = np.concatenate([o.half_width for o in organs], axis=1)
         self._first = np.cumsum([0, *(o.axis.shape[1] for o in organs)])
         self._tube = np.array([o.kind == STEM for o in organs])
+        n = len(self._axis)
+        self._fold = np.deg2rad(np.stack([np.broadcast_to(o.fold, n) for o in organs], axis=1))
 
     def draw(self, i: int) -> tuple[NDArray[np.float32], NDArray[np.int8]]:
         """Points (3, n_points) float32 on plant i, and the number (n_points,) of the organ that each lies on."""
@@ -146,7 +152,7 @@ class PopulationSurfaces:
         points = np.empty((3, s.n_points), np.float32)
         label = np.empty(s.n_points, np.int8)
         sample_surfaces(
-            self._axis[i], self._frame[i], self._half_width[i], self._first, self._tube,
+            self._axis[i], self._frame[i], self._half_width[i], self._first, self._tube, self._fold[i],
             s._along, s._across, s._cosine, s._sine, points, label,
         )  # fmt: skip
         return points, label
@@ -163,8 +169,10 @@ def mesh(organs: Sequence[Organ], n_around: int = 24) -> trimesh.Trimesh:
         frame = np.concatenate([organ.frame, organ.frame[-1:]])
         lateral = frame[:, :, 1]
         if organ.kind == LEAF:
-            side = organ.half_width[:, np.newaxis] * lateral
-            rings = np.stack([organ.axis - side, organ.axis, organ.axis + side], axis=1)
+            angle = np.deg2rad(organ.fold)
+            side = organ.half_width[:, np.newaxis] * np.cos(angle) * lateral
+            up = organ.half_width[:, np.newaxis] * np.sin(angle) * frame[:, :, 2]
+            rings = np.stack([organ.axis - side + up, organ.axis, organ.axis + side + up], axis=1)
             closed = False
         else:
             angle = np.linspace(0, 2 * np.pi, n_around, endpoint=False)[:, np.newaxis]

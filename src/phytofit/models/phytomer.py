@@ -49,6 +49,7 @@ class Phytomer:
     leaf_base_bend         deg   that the midrib turns down close to its start, over a twentieth of it or so
     leaf_shoulder          -     power of r in Eq. (2): above 1 the blade stays wide for longer, and is rounded there
     stem_taper             -     cm of its diameter that the stem loses with each cm, half-way below the leaf
+    leaf_fold              deg   that each half of the blade is raised along the midrib, to a V
     ====================== ===== =================================================================================
     """
 
@@ -80,6 +81,7 @@ class Phytomer:
         "leaf_base_bend",
         "leaf_shoulder",
         "stem_taper",
+        "leaf_fold",
     )
     UNITS = (
         "cm",
@@ -98,12 +100,13 @@ class Phytomer:
         "deg",
         "1",
         "1",
+        "deg",
     )
 
     @property
     def neutral(self) -> FloatArray:
         """Values (k,) of the parameters; those after the sixth give the paper's model, with no stem above the leaf."""
-        return np.array([*[np.nan] * 6, *[0.0] * 8, 1.0, self.widest_share, self.concavity, 1.0, 0.0, 1.0, 0.0])
+        return np.array([*[np.nan] * 6, *[0.0] * 8, 1.0, self.widest_share, self.concavity, 1.0, 0.0, 1.0, 0.0, 0.0])
 
     def width_profile(
         self,
@@ -150,7 +153,7 @@ class Phytomer:
             xs, given = np.hstack([xs, self.stem_above * xs[:, 1:2]]), given + 1
         rest = np.broadcast_to(self.neutral[given:], (n, len(self.PARAMETERS) - given))
         diameter, below, leaf_angle, leaf_length, leaf_width, rotate, above, offset, *shape = np.hstack([xs, rest]).T
-        bow, wave, side_bend, side_bow, roll, twist, *profile, ratio, base_bend, shoulder, stem_taper = shape
+        bow, wave, side_bend, side_bow, roll, twist, *profile, ratio, base_bend, shoulder, stem_taper, fold = shape
         base, widest, taper = profile
         log_slope = stem_taper / np.where(diameter > 0.0, diameter, 1.0)
         at_leaf = diameter * np.exp(-np.clip(0.5 * log_slope * below, -MOST_TAPERED, MOST_TAPERED))
@@ -183,7 +186,7 @@ class Phytomer:
         midrib[:, :, 2] += below[:, np.newaxis]
         midrib[:, :, 0] += (0.25 * at_leaf * (1.0 + ratio) * offset)[:, np.newaxis]
         share = self.width_profile(base, widest, taper, shoulder)
-        leaf = Organ(LEAF, midrib, frame, 0.5 * leaf_width[:, np.newaxis] * share)
+        leaf = Organ(LEAF, midrib, frame, 0.5 * leaf_width[:, np.newaxis] * share, fold)
         return stem, leaf
 
     def upside_down(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray] | None:
@@ -208,6 +211,7 @@ class Phytomer:
             "leaf_side_bend",
             "leaf_side_bow",
             "leaf_base_bend",
+            "leaf_fold",
         ):
             if name in names:
                 turn[names.index(name), names.index(name)] = -1.0

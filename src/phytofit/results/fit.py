@@ -125,7 +125,7 @@ class Fit(Shown):
 
     def _organs_of(self, x: FloatArray, *, whole: bool = False) -> tuple[Organ, ...]:
         own = (o.row(0) for o in self.species.model.organs(x))
-        stem, leaf = (Organ(o.kind, o.axis * self.scale, o.frame, o.half_width * self.scale) for o in own)
+        stem, leaf = (replace(o, axis=o.axis * self.scale, half_width=o.half_width * self.scale) for o in own)
         return stem, leaf if whole or self.estimate is None else leaf.until(self.estimate.ends_at)
 
     @cached_property
