@@ -68,7 +68,7 @@ def simulated_fit(job: Job) -> Fitted:
         result.x[: len(PARAMETERS)],
         np.array([t.value for t in phytofit.measure(made.organs)]),
         np.array([t.value for t in result.traits]),
-        any("the stem goes on" in flag for flag in result.flags),
+        "stem_ends_elsewhere" in result.flags,
     )
 
 

@@ -1,9 +1,9 @@
-"""Whether what is no phytomer is refused or marked unusable, and what is one never is.
+"""Whether what is no phytomer is refused or marked poor, and what is one never is.
 
     python benchmarks/not_phytomers.py [others] [phytomers] [cut] [--phytomers 200] [--each]
 
 others     leaves alone, stems alone, two leaves, whole plants, two phytomers, pots, walls and other bodies, real ones
-           from ../shared/data and simulated ones: how many of each kind are refused or marked unusable (goal: 95 %)
+           from ../shared/data and simulated ones: how many of each kind are refused or marked poor (goal: 95 %)
 phytomers  the paper's clouds, real and simulated, and phytomers of the project's own simulator with various noise,
            holes, views, outliers and without a tip: none of them should be
 cut        leaves with their piece of stem, cut from the labelled plants: seedlings and maize, unlike what is expected
@@ -29,7 +29,6 @@ from scipy.spatial.transform import Rotation
 import phytofit
 import phytofit.simulation
 from phytofit.cloud import size_cm
-from phytofit.results.remarks import UNUSABLE
 from phytofit.simulation import random_pose
 
 SPECIES = phytofit.load_species()
@@ -213,12 +212,12 @@ def cut() -> Iterator[Cloud]:
 
 
 def refused(cloud: Cloud) -> str:
-    """The sentence by which a cloud is refused or marked unusable; empty where it is measured."""
+    """The sentence by which a cloud is refused or marked poor; empty where it is measured."""
     try:
         result = phytofit.fit(phytofit.from_points(cloud.points, "cm", plausible_cm=(1.0, 1000.0)), threads=1)
     except phytofit.PhytofitError as error:
         return str(error)
-    return next((flag for flag in result.flags if flag.startswith(UNUSABLE)), "")
+    return next((str(one) for one in result.remarks if one.code == "other_surfaces"), "")
 
 
 def report(pool: ProcessPoolExecutor, those: list[Cloud], each: bool, *, wanted: bool) -> None:
@@ -229,7 +228,7 @@ def report(pool: ProcessPoolExecutor, those: list[Cloud], each: bool, *, wanted:
         if each or bool(why) != wanted:
             print(f"  {cloud.kind}: {cloud.name}: {why or 'measured'}", flush=True)
     for kind, found in of_kind.items():
-        print(f"{kind:28} {sum(found):4} of {len(found):4} refused or marked unusable")
+        print(f"{kind:28} {sum(found):4} of {len(found):4} refused or marked poor")
     every = [it for found in of_kind.values() for it in found]
     print(f"{'in all':28} {sum(every):4} of {len(every):4}: {100.0 * np.mean(every):.1f} %", flush=True)
 

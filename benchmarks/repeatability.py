@@ -43,11 +43,11 @@ WHOLE = Copy("whole")
 
 
 class Measured(NamedTuple):
-    """Of one fit: values, ends of the intervals, flags of each trait; None where it was refused."""
+    """Of one fit: values, ends of the intervals and quality of each trait; None where it was refused."""
 
     values: dict[str, float]
     ends: dict[str, tuple[float | None, float | None]]
-    flagged: dict[str, bool]
+    quality: dict[str, str]
 
 
 class Row(NamedTuple):
@@ -59,7 +59,7 @@ class Row(NamedTuple):
     half: float
     spread: dict[str, float]
     beyond: int
-    flagged: bool
+    quality: str
 
     @property
     def comes_back(self) -> bool:
@@ -87,7 +87,7 @@ def measured(job: tuple[phytofit.PointCloud, np.ndarray | None, Copy]) -> Measur
     return Measured(
         {t.name: t.value for t in traits},
         {t.name: (t.low, t.high) for t in traits},
-        {t.name: bool(t.flags) for t in traits},
+        {t.name: t.quality for t in traits},
     )
 
 
@@ -110,7 +110,7 @@ def rows_of(name: str, whole: Measured, copies: dict[Copy, Measured | None]) -> 
             off.setdefault(copy.kind, []).append(abs(there - value))
             beyond += not (-np.inf if low is None else low) <= there <= (np.inf if high is None else high)
         spread = {kind: float(np.quantile(each, COVERED, method="higher")) for kind, each in off.items()}
-        yield Row(name, trait, value, half_interval(value, low, high), spread, beyond, whole.flagged[trait])
+        yield Row(name, trait, value, half_interval(value, low, high), spread, beyond, whole.quality[trait])
 
 
 def report(title: str, found: dict[str, tuple[phytofit.PointCloud, np.ndarray | None]], copies: list[Copy],
@@ -120,7 +120,9 @@ def report(title: str, found: dict[str, tuple[phytofit.PointCloud, np.ndarray | 
     each = 1 + len(copies)
     kinds = list(dict.fromkeys(copy.kind for copy in copies))
     print(
-        f"\n{title}: value, half its interval, spread of copies " + ", ".join(kinds) + "; * wider than half; (flagged)"
+        f"\n{title}: value, half its interval, spread of copies "
+        + ", ".join(kinds)
+        + "; * wider than half; (quality, unless good)"
     )
     rows: list[Row] = []
     for i, name in enumerate(found):
@@ -133,8 +135,8 @@ def report(title: str, found: dict[str, tuple[phytofit.PointCloud, np.ndarray | 
         for row in mine:
             spreads = "".join(f"{row.spread[kind]:10.3g}" for kind in kinds)
             beyond = f"  {row.beyond} of {len(copies)} beyond the interval" if row.beyond else ""
-            wide, flagged = "" if row.comes_back else " *", " (flagged)" if row.flagged else ""
-            print(f"{name:18} {row.trait:22}{row.value:9.2f} ±{row.half:7.3g}{spreads}{wide}{flagged}{beyond}")
+            wide, quality = "" if row.comes_back else " *", "" if row.quality == "good" else f" ({row.quality})"
+            print(f"{name:18} {row.trait:22}{row.value:9.2f} ±{row.half:7.3g}{spreads}{wide}{quality}{beyond}")
         if refused:
             print(f"{name:18} {refused} of {len(copies)} copies were refused")
         rows += mine
@@ -143,7 +145,11 @@ def report(title: str, found: dict[str, tuple[phytofit.PointCloud, np.ndarray | 
 
 
 def print_share(title: str, rows: list[Row], kinds: list[str]) -> None:
-    for what, those in (("unflagged", [row for row in rows if not row.flagged]), ("all", rows)):
+    for what, those in (
+        ("good", [row for row in rows if row.quality == "good"]),
+        ("good and check", [row for row in rows if row.quality != "poor"]),
+        ("of all", rows),
+    ):
         if those:
             by_kind = ", ".join(
                 f"{kind} {np.mean([row.spread[kind] <= row.half for row in those]):.0%}" for kind in kinds

@@ -80,7 +80,7 @@ def length(path: Path, how: str, number: int, method: str, settings: dict[str, i
         return row
     found = next(t for t in result.traits if t.name == "leaf_length")
     ends = [np.nan if end is None else end for end in (found.low, found.high)]
-    return row | {"leaf_length": found.value, "low": ends[0], "high": ends[1], "flags": "; ".join(result.flags)}
+    return row | {"leaf_length": found.value, "low": ends[0], "high": ends[1], "flags": ";".join(result.flags)}
 
 
 def summary(table: pd.DataFrame, out: Path) -> None:

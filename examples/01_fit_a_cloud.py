@@ -31,11 +31,11 @@ result = phytofit.fit(cloud, **small)
 print(f"status: {result.status.value}")
 for note in result.notes:
     print(f"note: {note}")
-for flag in result.flags:
-    print(f"flag: {flag}")
+for remark in result.remarks:
+    print(f"{remark.grade}: {remark}")
 for trait in result.traits:
     beside = f"   true {trait_truth:.2f}" if (trait_truth := truth.get(trait.name)) is not None else ""
-    print(f"{trait.name:22}{trait.value:9.2f} {trait.unit:8}{beside}")
+    print(f"{trait.name:22}{trait.value:9.2f} {trait.unit:8}{trait.quality:6}{beside}")
 
 folder = phytofit.save_fit(result, cloud, arguments.out or Path(tempfile.mkdtemp(prefix="phytofit-")))
 print(f"The model on the points: {folder / 'fit.png'}")

@@ -25,6 +25,7 @@ def pairs_of(names, open_low=(), open_high=(), without=()):
             np.nan if i in (*open_low, *without) else value[i] - 3.0,
             np.nan if i in (*open_high, *without) else value[i] + 3.0,
             "",
+            "",
             1,
         )
         for i, name in enumerate(names)
@@ -82,7 +83,7 @@ def test_axis_labels_of_trials_fit_their_axes():
         for v in (1, 2)
         for t in ("leaf_length",)
     ]
-    columns = ["setting", "value", "trait", "unit", "n", "bias", "rmse", "within", "coverage", "flagged", "refused"]
+    columns = ["setting", "value", "trait", "unit", "n", "bias", "rmse", "within", "coverage", "good", "refused"]
     figure = plot_trials(pd.DataFrame(rows, columns=columns), 12.5, 12.5)
     figure.draw_without_rendering()
     for ax in figure.axes[::2]:

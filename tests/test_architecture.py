@@ -38,15 +38,16 @@ LAYERS = [
 DEPTH = {name: depth for depth, layer in enumerate(LAYERS) for name in layer}
 
 # A result's `plot` and `to_frame` import what stands above it when they are called, and only then.
-RESULTS = ("results/fit.py", "segmentation/whole.py", "reconstruct/depth.py")
+RESULTS = ("results/fitted.py", "segmentation/whole.py", "reconstruct/depth.py")
 SHOWS_ITSELF = {(file, part) for file in RESULTS for part in ("plots", "io")}
 
 # What a user needs; the rest is imported from its module.
 PUBLIC = """
-CAMERAS Agreement Camera CloudError Comparison Fit InputError NoPhytomerError NoStemError OutputError PhytofitError
-PlantRun PointCloud Reconstruction Segmentation SegmentedLeaf SettingError SimulatedPhytomer Species SpeciesError Status
-Trait UnitError agreement compare fit from_points load_camera load_species measure read_cloud read_measures read_results
-recipe reconstruct run save_fit save_reconstruction save_segmentation segment separate_plants simulate write_cloud
+CAMERAS Agreement Camera CloudError Comparison Fit InputError NoPhytomerError NoStemError OutputError PaperFit
+PhytofitError PlantRun PointCloud Reconstruction Remark Segmentation SegmentedLeaf SettingError SimulatedPhytomer
+Species SpeciesError Status Trait UnitError agreement compare fit from_points load_camera load_species measure
+read_cloud read_measures read_results recipe reconstruct run save_fit save_reconstruction save_segmentation segment
+separate_plants simulate write_cloud
 """
 
 FILES = sorted(SOURCE.rglob("*.py"))

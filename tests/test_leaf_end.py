@@ -12,7 +12,7 @@ from phytofit.engine.posterior import Posterior
 from phytofit.engine.visibility import N_STRIPS, Hidden
 from phytofit.models import Organ, move
 from phytofit.models.organs import frames_along
-from phytofit.results.fit import remarked
+from phytofit.results import reviewed
 from phytofit.traits import measure
 
 SPECIES = phytofit.load_species()
@@ -196,8 +196,8 @@ def test_only_a_leaf_that_is_clearly_too_long_is_called_cut_back():
     made = phytofit.simulate(n_points=1500, noise_cm=0.3, seed=3)
     result = phytofit.fit(made.points, "cm", threads=2)
     for too_long in (True, False):
-        cut = replace(result, flags=(), estimate=replace(result.estimate, ends_at=0.9, too_long=too_long))
-        assert any("on the last 10 % of the fitted leaf" in flag for flag in remarked(cut).flags) == too_long
+        cut = replace(result, observed=(), estimate=replace(result.estimate, ends_at=0.9, too_long=too_long))
+        assert any("on the last 10 % of the fitted leaf" in one.text for one in reviewed(cut).remarks) == too_long
 
 
 def test_upside_down_the_leaf_ends_where_it_does():

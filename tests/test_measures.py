@@ -346,11 +346,12 @@ def test_a_table_of_results_is_read_as_a_spreadsheet_saves_it_again(tmp_path):
     (row,) = phytofit.read_results(tmp_path).to_dict("records")
     assert (row["value"], row["low"], row["unit"], row["rank"], row["plant"]) == (1234.5, 1200.0, "cm²", "1", "")
     assert pd.isna(row["high"])
-    names = ["cloud", "plant", "organ", "rank", "trait", "value", "unit", "low", "high", "method", "flags"]
-    rows = [names, ["0003", 2, "leaf", 1, "leaf_area", 1234.5, "cm2", 1200.0, None, "m", None]]
+    names = ["cloud", "plant", "organ", "rank", "trait", "value", "unit", "low", "high", "quality", "flags", "method"]
+    rows = [names, ["0003", 2, "leaf", 1, "leaf_area", 1234.5, "cm2", 1200.0, None, "check", None, "m"]]
     found = phytofit.read_results(workbook(tmp_path / "traits.xlsx", traits=rows))
-    (row,) = found.to_dict("records")
-    assert (row["cloud"], row["value"], row["unit"], row["plant"], row["flags"]) == ("0003", 1234.5, "cm²", "2", "")
+    (new,) = found.to_dict("records")
+    assert (new["cloud"], new["value"], new["unit"], new["plant"], new["flags"]) == ("0003", 1234.5, "cm²", "2", "")
+    assert (new["quality"], row["quality"], row["flags"]) == ("check", "", "tip")  # the older one does not say
 
 
 @pytest.mark.skipif(not AWKWARD.is_dir(), reason="no data")

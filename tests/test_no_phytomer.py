@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 import phytofit
 import phytofit.simulation
 from phytofit.engine.unexplained import on_something_else
-from phytofit.results.fit import MUCH_ELSEWHERE, remarked
-from phytofit.results.remarks import UNUSABLE
+from phytofit.results.review import MUCH_ELSEWHERE, reviewed
 
 SEEDS = st.integers(0, 2**32 - 1)
 FIXED = {"leaf_length": 50.0, "leaf_angle": 50.0, "leaf_width": 6.0, "stem_diameter": 3.0, "stem_length": 15.0}
@@ -101,7 +100,7 @@ def test_a_phytomer_among_outliers_and_without_a_piece_is_measured(made):
     )
     found = phytofit.fit(points, "cm", threads=2)
     assert found.estimate.sighting.elsewhere < 0.25 * MUCH_ELSEWHERE
-    assert not any(flag.startswith(UNUSABLE) for flag in found.flags)
+    assert "other_surfaces" not in found.flags
     assert next(t.value for t in found.traits if t.name == "leaf_length") == pytest.approx(48.0, abs=2.0)
 
 
@@ -126,14 +125,13 @@ def test_labels_say_what_is_stem_and_leaf_whatever_else_there_is(made):
     assert next(t.value for t in found.traits if t.name == "leaf_length") == pytest.approx(48.0, abs=2.0)
 
 
-def test_what_a_seed_point_leaves_of_others_is_a_flag(made):
-    """The seed point says which leaf is meant; the flag comes with every trait."""
+def test_what_a_seed_point_leaves_of_others_makes_every_trait_poor(made):
     found = phytofit.fit(made.points, "cm", seed_point=made.organs[1].axis[12], threads=2)
-    assert not any(flag.startswith(UNUSABLE) for flag in found.flags)
+    assert "other_surfaces" not in found.flags
     seen = dataclasses.replace(found.estimate.sighting, elsewhere=0.3)
-    crowded = remarked(dataclasses.replace(found, estimate=dataclasses.replace(found.estimate, sighting=seen)))
-    assert all(any("30 % of the points lie on surfaces" in flag for flag in t.flags) for t in crowded.traits)
-    assert any(flag.startswith(UNUSABLE) for flag in crowded.flags)
+    crowded = reviewed(dataclasses.replace(found, estimate=dataclasses.replace(found.estimate, sighting=seen)))
+    assert all("other_surfaces" in t.flags and t.quality == "poor" for t in crowded.traits)
+    assert any("30 % of the points lie on surfaces" in one.text for one in crowded.remarks)
 
 
 @pytest.mark.parametrize(
@@ -147,11 +145,11 @@ def test_what_is_too_large_for_a_stem_or_too_short_for_a_leaf_is_none(fitted, na
     x = fitted.x.copy()
     x[fitted.species.space.index(name)] = value
     with pytest.raises(phytofit.NoPhytomerError, match=said):
-        remarked(dataclasses.replace(fitted, x=x))
-    remarked(dataclasses.replace(fitted, x=x), labelled=True)  # then it is known what is stem and leaf
+        reviewed(dataclasses.replace(fitted, x=x))
+    reviewed(dataclasses.replace(fitted, x=x), labelled=True)  # then it is known what is stem and leaf
 
 
 def test_without_a_unit_no_stem_is_too_thick(fitted):
     x = fitted.x.copy()
     x[0] = 8.0
-    assert remarked(dataclasses.replace(fitted, x=x, relative=True)).flags
+    assert reviewed(dataclasses.replace(fitted, x=x, relative=True)).flags

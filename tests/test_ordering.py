@@ -69,7 +69,8 @@ def made():
 
 def numbers(result):
     """All that is stored of a fit."""
-    values = [result.x, result.covariance, result.pose, np.array([result.error])]
+    errors = [result.covariance] if isinstance(result, phytofit.Fit) else []
+    values = [result.x, *errors, result.pose, np.array([result.error])]
     values += [np.array([t.value, t.low or 0.0, t.high or 0.0]) for t in result.traits]
     values += [array for g in result.history for array in (g.mean, g.cov)]
     return b"".join(value.tobytes() for value in values), result.flags, result.notes

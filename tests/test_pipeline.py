@@ -151,11 +151,11 @@ def test_a_leaf_that_can_t_be_fitted_keeps_its_length_and_is_not_tried_again(mad
     assert len(tried) == 2 * leaves
     assert again.skipped == ("segment", *(f"leaf_{rank:02d}" for rank in range(1, leaves + 1)))
     pd.testing.assert_frame_equal(first.table, again.table)
-    assert sum("not fitted: no stem with a leaf" in flag for flag in again.flags) == leaves
+    assert sum("not fitted: no stem with a leaf" in one.remark.text for one in again.remarks) == leaves
     lengths = again.table[again.table["trait"] == "leaf_length"]["value"].tolist()
     assert lengths == [printed(leaf.length) for leaf in first.segmentations[0].leaves]
     assert (out / "leaves" / "leaf_01" / "fit.json").exists()  # with another seed it could be fitted
-    assert sum("not fitted" in flag for flag in other.flags) == leaves - 1
+    assert sum(one.remark.code == "not_fitted" for one in other.remarks) == leaves - 1
 
 
 def test_a_fit_that_leaves_most_of_the_points_out_is_not_the_leaf(made, first_fit, tmp_path, monkeypatch):
@@ -166,7 +166,10 @@ def test_a_fit_that_leaves_most_of_the_points_out_is_not_the_leaf(made, first_fi
     found = run(tmp_path / "copy" / "plant.ply", tmp_path / "copy" / "out", units="cm", up="z", seed=1, threads=1)
     lengths = found.table[found.table["trait"] == "leaf_length"]
     assert lengths["value"].tolist() == [printed(leaf.length) for leaf in found.segmentations[0].leaves]
-    assert all("not fitted: the model does not explain 60 % of the points" in flags for flags in lengths["flags"])
+    assert lengths["flags"].str.split(";").map(lambda codes: codes[0] == "not_fitted").all()
+    assert set(lengths["quality"]) == {"check"}
+    said = {one.remark.text for one in found.remarks if one.remark.code == "not_fitted"}
+    assert said == {"not fitted: the model does not explain 60 % of the points"}
 
 
 def test_meshes_and_a_workbook_are_written_where_they_are_asked_for(made, first_fit, tmp_path, monkeypatch):
@@ -216,7 +219,7 @@ def test_two_plants_in_one_cloud_are_both_measured(tmp_path, monkeypatch):
     }
     assert {path.name for path in out.iterdir()} == {"plant_1", "plant_2", "traits.csv", "plant.png", "plants.png"}
     assert ("fit", 4, 6) in stages
-    assert any(flag.startswith("plant 2: leaf 1: not fitted") for flag in made.flags)
+    assert ("not_fitted", 2, 1) in {(one.remark.code, one.plant, one.rank) for one in made.remarks}
     again = run(tmp_path / "two.ply", out, units="cm", up="z")
     assert again.skipped == ("segment", *(f"plant {i}: leaf_0{k}" for i in (1, 2) for k in (1, 2, 3)))
     pd.testing.assert_frame_equal(again.table, made.table)

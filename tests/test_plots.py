@@ -18,11 +18,12 @@ import phytofit
 import phytofit.plots
 from phytofit.io import trait_table
 from phytofit.plots import plot_plant, plot_plants
-from phytofit.plots.page import digits, fitting, folded, in_short, interval, number, width_in
-from phytofit.plots.phytomer import MEASURE
+from phytofit.plots.page import QUALITY, digits, fitting, folded, interval, number, width_in
+from phytofit.plots.phytomer import MEASURE, SHOWN
 from phytofit.plots.plant import LEAF_COLORS
 from phytofit.plots.views import widest_side
 from phytofit.reconstruct.placing import Rejected
+from phytofit.results import remark
 from phytofit.segmentation import SegmentedLeaf
 from phytofit.traits import Trait
 
@@ -76,7 +77,7 @@ def bent(fitted):
     return replace(fitted, species=species, x=x, trait_covariance=0.01 * np.eye(len(x)))
 
 
-FLAGS = ["the tip was not seen: the leaf may be longer", "only 9 % of the leaf was seen", HOSTILE * 9]
+REMARKS = [remark("tip_unseen"), remark("leaf_mostly_unseen", share="9 %"), remark("views", said=HOSTILE * 9)]
 TITLES = st.one_of(st.text(max_size=60), st.just(HOSTILE))
 SHAPES = {
     "stem_diameter": st.floats(0.05, 8.0),
@@ -95,13 +96,13 @@ SHAPES = {
 @given(
     st.fixed_dictionaries(SHAPES),
     arrays(float, st.tuples(st.integers(1, 40), st.just(3)), elements=st.floats(-60.0, 60.0)),
-    st.lists(st.sampled_from(FLAGS), max_size=9),
+    st.lists(st.sampled_from(REMARKS), max_size=9),
     TITLES,
     st.sampled_from([None, 1e-4, 3e5]),
 )
-def test_a_fit_of_any_shape_has_its_picture(bent, shape, points, flags, title, scale):
+def test_a_fit_of_any_shape_has_its_picture(bent, shape, points, remarks, title, scale):
     x = np.array([shape.get(name, value) for name, value in zip(bent.species.space.names, bent.x, strict=True)])
-    odd = replace(bent, x=x, reference=points, flags=tuple(flags))
+    odd = replace(bent, x=x, reference=points, observed=tuple(remarks))
     rendered(phytofit.plots.plot_fit(odd if scale is None else replace(odd, relative=True, scale=scale), title))
 
 
@@ -122,6 +123,20 @@ def test_what_is_drawn_as_measured_is_to_scale(fitted):
     assert np.rad2deg(np.arccos(cosine)) == pytest.approx(traits["leaf_angle"], abs=1e-4)
     assert rays[0][0] == pytest.approx(0.0, abs=1e-9)  # the stem is upright
     assert "length" in " ".join(words_of(figure))
+
+
+def test_quality_is_seen_by_mark_and_colour(fitted):
+    """Each trait has its mark, a remark that of its grade; their colours differ."""
+    odd = replace(fitted, observed=(remark("two_fits", traits=["leaf_angle"], others="another"), remark("tip_unseen")))
+    words = words_of(phytofit.plots.plot_fit(odd, "leaf"))
+    traits = {trait.name: trait.quality for trait in odd.traits}
+    assert (traits["leaf_angle"], traits["leaf_length"], traits["stem_diameter"]) == ("poor", "check", "good")
+    shown = [traits[name] for name in SHOWN]
+    for quality, (mark, _) in QUALITY.items():
+        graded = [one for one in odd.remarks if one.grade == quality]
+        assert words.count(mark) == shown.count(quality) + len(graded)
+    assert any("(two_fits)" in word for word in words)
+    assert len({color for _, color in QUALITY.values()}) == len({mark for mark, _ in QUALITY.values()}) == 3
 
 
 def test_the_same_fit_gives_the_same_bytes(fitted):
@@ -145,7 +160,7 @@ def plant_of(seed, n_leaves, n_points, *, size=30.0, unit="cm", up=None):
         shares = random.random((n_points, 1))
         points.append(midrib[0] + shares * (midrib[-1] - midrib[0]))
         labels.append(np.full(n_points, rank + 1))
-        flags = ("collar next to another leaf's: their ranks may be swapped",) if rank % 2 else ()
+        flags = ("rank_uncertain", HOSTILE) if rank % 2 else ()
         leaves.append(
             SegmentedLeaf(rank, 0.0, collar, size * rank, size * rank, midrib[-1], midrib, size, n_points, flags)
         )
@@ -159,12 +174,13 @@ def plant_of(seed, n_leaves, n_points, *, size=30.0, unit="cm", up=None):
 
 def traits_of(plant, *, number=1):
     unit = "rel" if plant.cloud.unit == "none" else "cm"
-    traits = [Trait("plant", 0, "plant_height", 61.25, unit, None, None, "", ())]
+    traits = [Trait("plant", 0, "plant_height", 61.25, unit)]
     for leaf in plant.leaves[::-1]:
-        flags = ("not fitted: no stem was found", HOSTILE)
-        traits.append(Trait("internode", leaf.rank, "stem_diameter", 1.5 + leaf.rank, unit, 2.125, None, "", flags))
-        traits.append(Trait("leaf", leaf.rank, "leaf_length", 1e5 * leaf.rank, unit, None, 2e9, "", flags))
-        traits.append(Trait("leaf", leaf.rank, "leaf_angle", 12.5, "deg", 10.0, 15.0, "", flags))
+        flags = ("not_fitted", HOSTILE)
+        diameter = Trait("internode", leaf.rank, "stem_diameter", 1.5 + leaf.rank, unit, 2.125, None, "good", flags)
+        length = Trait("leaf", leaf.rank, "leaf_length", 1e5 * leaf.rank, unit, None, 2e9, "check", flags)
+        angle = Trait("leaf", leaf.rank, "leaf_angle", 12.5, "deg", 10.0, 15.0, "poor", flags)
+        traits += [diameter, length, angle]
     return trait_table("plant", traits, plant=number)
 
 
@@ -224,7 +240,7 @@ def test_a_cloud_of_many_points_has_its_picture_without_much_memory():
 def test_a_plant_s_table_says_what_was_measured_and_what_is_wrong():
     plant = plant_of(0, 2, 9)
     words = words_of(plot_plant(plant, traits_of(plant)))
-    for word in ("61.2 cm", "2.50 cm", "(≥ 2.12)", "below leaf 1", "12.5", "(10.0–15.0)"):
+    for word in ("61.2 cm", "2.50 cm ●", "(≥ 2.12)", "below leaf 1", "12.5 ✖", "(10.0–15.0)"):
         assert word in words
     assert any("not fitted" in word for word in words)
     assert not any("traits.csv" in word for word in words)
@@ -284,17 +300,3 @@ def test_text_fits(text, width, most):
 def test_numbers_are_as_precise_as_their_intervals(values, expected):
     decimals = digits(*values)
     assert (number(values[0], decimals), interval(*values[1:], decimals)) == expected
-
-
-@pytest.mark.parametrize(
-    ("flag", "short"),
-    [
-        ("the leaf ends bluntly: if its tip was not seen, it is longer", "the leaf ends bluntly"),
-        ("not fitted: no stem was found: expected a stem", "not fitted: no stem was found"),
-        ("only 38 % of the leaf was seen", "only 38 % of the leaf was seen"),
-        ("the stem was seen from one side (180° of it): it may be off. Scan", "the stem was seen from one side"),
-        ("width 3.5 cm is off. Measure again.", "width 3.5 cm is off"),
-    ],
-)
-def test_remarks_in_short(flag, short):
-    assert in_short(flag) == short

@@ -38,7 +38,7 @@ COLUMNS = ["cloud", "trait", "value"]
 
 
 def area(value=1.25):
-    return Trait("leaf", 1, "leaf_area", value, "cm²", None, 2.0, "truth", ("the stem lacks 40° of its turn",))
+    return Trait("leaf", 1, "leaf_area", value, "cm²", None, 2.0, flags=("tip_unseen", "width_holes"), method="40° off")
 
 
 @given(st.lists(st.tuples(PARTS, PARTS, st.sampled_from([".ply", ".PLY", ".xyz"])), min_size=1, max_size=8))
@@ -58,7 +58,8 @@ def test_a_table_is_ascii_but_for_names_and_comes_back(tmp_path):
     assert (tmp_path / "traits.csv").read_bytes().isascii()
     back = read_table(tmp_path / "traits.csv")
     assert back["unit"].tolist() == ["cm²"]
-    assert "40 deg" in back["flags"][0]
+    assert "40 deg" in back["method"][0]
+    assert back["flags"][0] == "tip_unseen;width_holes"
     named = trait_table("Möhre", [area()])
     write_table(tmp_path / "traits.csv", named)
     assert (tmp_path / "traits.csv").read_bytes().startswith(b"\xef\xbb\xbf")  # or a spreadsheet shows MÃ¶hre

@@ -11,6 +11,7 @@ from phytofit.errors import SettingError, UnitError
 from phytofit.io import COLUMNS, trait_table
 from phytofit.pipeline import PlantRun
 from phytofit.reconstruct import CAMERAS, Reconstruction
+from phytofit.results import Placed, remark
 from phytofit.segmentation import Segmentation, SegmentedLeaf
 
 HOSTILE = "<b>[red]x[/]\x1b[31m\n=cmd"
@@ -49,7 +50,7 @@ def results(fitted, segmented):
     made = Reconstruction(
         segmented.cloud, turned, turned + 1, camera, ("a.png",), eye, pairs=(), flags=(HOSTILE,), **nothing
     )
-    run = PlantRun(trait_table("plant", fitted.traits), (segmented,), (HOSTILE,), (), ())
+    run = PlantRun(trait_table("plant", fitted.traits), (segmented,), (Placed(remark("views", said=HOSTILE)),), (), ())
     return {"fit": fitted, "segmentation": segmented, "reconstruction": made, "run": run}
 
 

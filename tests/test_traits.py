@@ -214,10 +214,9 @@ def test_leaves_are_ranked_from_the_base_and_named_with_units():
     traits = measure(
         [stem(), straight(40.0, 30.0, height=5.0), straight(60.0, 50.0, height=20.0)],
         method="cross-entropy",
-        flags=("tip hidden",),
     )
     assert [(t.organ, t.rank) for t in traits] == [(STEM, 0)] * 2 + [(LEAF, 1)] * 6 + [(LEAF, 2)] * 6
-    assert {(t.method, t.flags, t.low, t.high) for t in traits} == {("cross-entropy", ("tip hidden",), None, None)}
+    assert {(t.method, t.quality, t.flags, t.low, t.high) for t in traits} == {("cross-entropy", "", (), None, None)}
     units = {t.name: t.unit for t in traits}
     assert units == {
         "stem_diameter": "cm",

@@ -17,7 +17,7 @@ from phytofit.validation import agreement, compare, concordance, read_measures, 
 
 AWKWARD = Path(__file__).parents[1] / "../shared/data/awkward"
 LEAVES = ((1, 20.0), (2, 30.0), (3, 40.0))  # ranks, and lengths in cm
-RESULT = "cloud,plant,organ,rank,trait,value,unit,low,high,method,flags\n"
+RESULT = "cloud,plant,organ,rank,trait,value,unit,low,high,quality,flags,method\n"
 ROUNDING = 1e-9
 
 
@@ -40,7 +40,7 @@ def measures_of(rows):
 
 
 def test_the_truth_of_simulated_phytomers_is_read(tmp_path):
-    path = written(tmp_path, RESULT + "phytomer_0001,1,leaf,1,leaf_length,55.5,cm,,,truth,\n")
+    path = written(tmp_path, RESULT + "phytomer_0001,1,leaf,1,leaf_length,55.5,cm,,,,,truth\n")
     assert read_measures(path)["value"].tolist() == [55.5]
     assert read_results(path)["value"].tolist() == [55.5]
     assert read_results(path)["low"].isna().all()
@@ -106,7 +106,7 @@ def test_one_that_is_far_off_is_named_and_none_of_a_few():
 
 def test_the_command_writes_one_page_and_two_tables(tmp_path):
     rows = "".join(
-        f"c{i},1,leaf,1,leaf_length,{50 + i},cm,{48 + i},{'' if i == 2 else 52 + i},m,{'tip' if i == 2 else ''}\n"
+        f"c{i},1,leaf,1,leaf_length,{50 + i},cm,{48 + i},{',check,tip_unseen' if i == 2 else f'{52 + i},good,'},m\n"
         for i in range(4)
     )
     (tmp_path / "results").mkdir()
@@ -119,7 +119,7 @@ def test_the_command_writes_one_page_and_two_tables(tmp_path):
     assert "measured, no result: c0, leaf_width" in done.output
     assert "result, not measured: c3" in done.output
     table = pd.read_csv(tmp_path / "v" / "validation.csv").iloc[0]
-    assert (table["trait"], table["n"], table["flagged"]) == ("leaf_length", 3, 1)
+    assert tuple(table[["trait", "n", "good", "check", "poor"]]) == ("leaf_length", 3, 2, 1, 0)
     assert table["bias"] == pytest.approx((-0.5 - 0.2 - 8.0) / 3, abs=1e-5)
     assert table["coverage"] == pytest.approx(1.0)  # open above where the tip was not seen
     assert len(pd.read_csv(tmp_path / "v" / "pairs.csv")) == 3
@@ -139,7 +139,7 @@ def test_the_command_writes_one_page_and_two_tables(tmp_path):
 )
 def test_the_command_says_what_is_wrong(tmp_path, results, said):
     hand = written(tmp_path, "cloud,trait,value,unit\na,leaf_length,3,cm\n")
-    written(tmp_path, RESULT + "b,1,leaf,1,leaf_length,3,cm,,,m,\n", "other.csv")
+    written(tmp_path, RESULT + "b,1,leaf,1,leaf_length,3,cm,,,,,m\n", "other.csv")
     done = CliRunner().invoke(
         app, ["validate", str(tmp_path / results), "--truth", str(hand), "--out", str(tmp_path / "v")]
     )

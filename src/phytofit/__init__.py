@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from phytofit.pipeline import PlantRun, run
     from phytofit.recipe import recipe
     from phytofit.reconstruct import CAMERAS, Camera, Reconstruction, load_camera, reconstruct
-    from phytofit.results.fit import Fit
+    from phytofit.results import Fit, PaperFit, Remark
     from phytofit.segmentation import Segmentation, SegmentedLeaf, segment, separate_plants
     from phytofit.simulation import SimulatedPhytomer, simulate
     from phytofit.species import Species, load_species
@@ -47,10 +47,12 @@ __all__ = [
     "NoPhytomerError",
     "NoStemError",
     "OutputError",
+    "PaperFit",
     "PhytofitError",
     "PlantRun",
     "PointCloud",
     "Reconstruction",
+    "Remark",
     "Segmentation",
     "SegmentedLeaf",
     "SettingError",
@@ -101,7 +103,11 @@ MODULES = {  # that are imported when the first of their names is asked for, so 
         "Status",
         "UnitError",
     ),
-    "phytofit.results.fit": ("Fit",),
+    "phytofit.results": (
+        "Fit",
+        "PaperFit",
+        "Remark",
+    ),
     "phytofit.fitting": ("fit",),
     "phytofit.pipeline": (
         "PlantRun",

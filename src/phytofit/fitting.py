@@ -3,10 +3,10 @@
 import inspect
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,7 @@ from phytofit.errors import ONE_LEAF_ONLY, NoPhytomerError, SettingError, Status
 from phytofit.paper import DISTANCES, CrossEntropy, Generation, PaperObjective, Reference, minimise
 from phytofit.paper.scouting import scout
 from phytofit.parsing import checked_flag, checked_number, checked_whole, parse_points, parse_up
-from phytofit.results.fit import Fit, beside_its_rival, remarked
+from phytofit.results import Fit, PaperFit, Remark, beside_its_rival, remark, reviewed
 from phytofit.segmentation.plants import separate_plants
 from phytofit.species import Species, load_species
 from phytofit.start.pose import StartPose, parts_of_stem
@@ -27,13 +27,12 @@ from phytofit.start.prepare import DITHER_CM, Prepared, dithered, prepare
 __all__ = ["METHODS", "fit", "mean_at"]
 
 FloatArray = NDArray[np.float64]
+Found = TypeVar("Found", Fit, PaperFit)
 N_SEARCHED = 7  # those and the stem above the leaf
 SEARCH = ("n_samples", "n_generations", "elite_fraction", "covariance_noise")
 DITHERED = f"the points had no noise: {DITHER_CM:g} cm was added, because the fit needs some"
 LEAST_ALIKE = 0.5  # of the stem's parts above and below a leaf, shorter over longer: half-way from "none" to "equal"
 PLAUSIBLE_LEAD = 4.0  # by so much less squared Mahalanobis distance from the prior is one of two more plausible
-UP_DOUBTFUL = "with the stated up, the leaf points down or bends upwards: check which way is up"
-UP_UNKNOWN = "this leaf does not show which way is up: leaf angle may be 180° minus this value. State up if it is known"
 
 
 def fit(
@@ -55,8 +54,10 @@ def fit(
     seed: int = 0,
     threads: int | None = None,
     progress: Callable[[Generation], None] | None = None,
-) -> Fit:
+) -> Fit | PaperFit:
     """Fit the species' phytomer model to a cloud of one leaf on its piece of stem.
+
+    Returns a :class:`Fit` by method "likelihood", a :class:`PaperFit` by method "paper".
 
     Parameters
     ----------
@@ -133,7 +134,7 @@ def _fit(
     seed: int,
     threads: int | None,
     progress: Callable[[Generation], None] | None,
-) -> Fit:
+) -> Fit | PaperFit:
     """As :func:`fit`, of settings that were checked: `used`, of which `search` were chosen."""
     one_thread = threadpool_limits(limits=1, user_api="blas")  # more would round sums in another order
     with one_thread, ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
@@ -153,7 +154,7 @@ def _fit(
         pose=pose,
         error=result.error * found.scale if method == "paper" else result.error,
         reference=found.used.points[found.kept],
-        flags=(*((result.status.value,) if not result.status.good else ()), *found.flags, *result.flags),
+        observed=(*_of_the_way(result.status, found), *result.observed),
         notes=(*cloud.notes, *found.notes, *result.notes),
         relative=cloud.unit == "none",
         scale=found.scale,
@@ -166,8 +167,18 @@ def _fit(
         },
     )
     labelled = found.organ is not None and bool((found.organ == 0).any() and (found.organ == 1).any())
-    result = _beside_its_stem(_right_way_up(beside_its_rival(result), direction), found)
-    return remarked(result, labelled=labelled)
+    if isinstance(result, PaperFit):
+        return _beside_its_stem(_right_way_up(result, direction), found)
+    upright = _right_way_up(beside_its_rival(result), direction)
+    return reviewed(_beside_its_stem(upright, found), labelled=labelled)
+
+
+def _of_the_way(status: Status, found: Prepared) -> Iterator[Remark]:
+    """Remarks on how the fit went, and on what was fitted."""
+    if not status.good:
+        yield remark("search_split" if status is Status.SPLIT_ELITE else "not_converged")
+    if found.others_touch:
+        yield remark("others_touch")
 
 
 def fit_paper(
@@ -185,7 +196,7 @@ def fit_paper(
     covariance_noise: float = 0.5,
     random_start: bool = False,
     stem_above: str = "equal",
-) -> Fit:
+) -> PaperFit:
     """The paper's method: cross-entropy search for the phytomer whose points, aligned by ICP, lie nearest the cloud."""
     species = species.with_stem_above(stem_above).leading(N_SEARCHED)
     objective = PaperObjective(
@@ -208,17 +219,15 @@ def fit_paper(
     )
     minimise(search, objective, progress)
     registration, error = objective.register(search.mean)
-    return Fit(
+    return PaperFit(
         species=species,
         x=search.mean,
-        covariance=search.history[-1].cov,
         pose=registration.T_target_source,
         error=error,
         history=tuple(search.history),
         status=Status.CONVERGED if error <= search.history[-1].threshold else Status.SPLIT_ELITE,
         seed=seed,
         reference=found.points,
-        method="paper",
         registration=registration,
     )
 
@@ -267,13 +276,12 @@ def fit_likelihood(
         status=Status.AT_REST if most_probable.converged else Status.MOVING,
         seed=seed,
         reference=found.points,
-        method="likelihood",
         estimate=most_probable,
         notes=(DITHERED,) if points is not found.points else (),
     )
 
 
-METHODS: dict[str, Callable[..., Fit]] = {"likelihood": fit_likelihood, "paper": fit_paper}
+METHODS: dict[str, Callable[..., Fit | PaperFit]] = {"likelihood": fit_likelihood, "paper": fit_paper}
 
 
 def _means(found: Prepared, species: Species, random_start: bool, seed: int) -> list[FloatArray]:
@@ -292,56 +300,39 @@ def _foot_pose(start: StartPose) -> FloatArray:
     return pose
 
 
-def _defaults(function: Callable[..., Fit]) -> dict[str, Any]:
+def _defaults(function: Callable[..., Fit | PaperFit]) -> dict[str, Any]:
     parameters = inspect.signature(function).parameters.values()
     return {p.name: p.default for p in parameters if p.default is not inspect.Parameter.empty}
 
 
-def _right_way_up(result: Fit, up: FloatArray | None) -> Fit:
+def _right_way_up(result: Found, up: FloatArray | None) -> Found:
     """The result or its twin that is upside down: the same organs, so that no cloud can tell which is right.
 
-    A stated `up` (3,) decides, and a flag says where the other is clearly more plausible.  Where up is not known, the
-    one counts whose leaf is the more plausible by the prior (leaves leave the stem upwards and bend down), and a flag
+    A stated `up` (3,) decides, and a remark says where the other is clearly more plausible.  Where up is not known, the
+    one counts whose leaf is the more plausible by the prior (leaves leave the stem upwards and bend down), and a remark
     says where neither is clearly so.
     """
-    space = result.species.space
-    found = result.species.model.upside_down(result.x)
-    searched = result.species.model.upside_down(result.x[: len(result.history[0].mean)])
-    if found is None or searched is None:
+    twin = result.upside_down()
+    if twin is None:
         return result
-    turn, offset, pose = found
-    pose[:3, 3] *= result.scale
-    part, shift, _ = searched
-    twin = replace(
-        result,
-        x=turn @ result.x + offset,
-        covariance=turn @ result.covariance @ turn.T,
-        trait_covariance=None if result.trait_covariance is None else turn @ result.trait_covariance @ turn.T,
-        pose=result.pose @ pose,
-        history=tuple(
-            replace(g, mean=part @ g.mean + shift, cov=part @ g.cov @ part.T, best_x=part @ g.best_x + shift)
-            for g in result.history
-        ),
-    )
+    space = result.species.space
     shape = [space.index(name) for name in ("leaf_angle", "leaf_rotate_angle")]
     surprise, surprise_of_twin = (
         float(np.sum(((it.x[shape] - space.mean[shape]) / space.std[shape]) ** 2)) for it in (result, twin)
     )
     if up is not None:
-        told, doubt = (
+        stated, doubt = (
             (result, surprise - surprise_of_twin)
             if result.pose[:3, 2] @ up >= 0.0
             else (twin, surprise_of_twin - surprise)
         )
-        return replace(told, flags=(*told.flags, UP_DOUBTFUL)) if doubt > PLAUSIBLE_LEAD else told
+        return _with(stated, remark("up_doubtful")) if doubt > PLAUSIBLE_LEAD else stated
     better = twin if surprise_of_twin < surprise else result
-    if abs(surprise - surprise_of_twin) < PLAUSIBLE_LEAD:
-        return replace(better, flags=(*better.flags, UP_UNKNOWN))
-    return better
+    return _with(better, remark("up_unknown")) if abs(surprise - surprise_of_twin) < PLAUSIBLE_LEAD else better
 
 
-def _beside_its_stem(result: Fit, found: Prepared) -> Fit:
-    """The result, with a flag where the cloud's stem does not end as `stem_above` says: as the start pose saw it, and
+def _beside_its_stem(result: Found, found: Prepared) -> Found:
+    """The result, with a remark where the cloud's stem does not end as `stem_above` says: as the start pose saw it, and
     as the leaf's points beside the fitted stem say too, since either may be wrong."""
     how = str(result.settings["stem_above"])
     axis = result.pose[:3, 2]
@@ -358,11 +349,12 @@ def _beside_its_stem(result: Fit, found: Prepared) -> Fit:
         return result
     unit = "" if result.relative else " cm"
     over, under = (f"{length * found.scale:.3g}{unit}" for length in (above, below))
-    text = (
-        f"the stem goes on {over} above the leaf and {under} below it: "
-        f"stem_above={'equal' if alike[0] else 'free'!r} may fit better than {how!r}"
-    )
-    return replace(result, flags=(*result.flags, text))
+    better = "equal" if alike[0] else "free"
+    return _with(result, remark("stem_ends_elsewhere", above=over, below=under, better=better, how=how))
+
+
+def _with(result: Found, one: Remark) -> Found:
+    return replace(result, observed=(*result.observed, one))
 
 
 def mean_at(start: StartPose, species: Species) -> FloatArray:

@@ -10,7 +10,7 @@ from phytofit.paper.distances import chamfer, hausdorff, labelled_hausdorff, qua
 from phytofit.paper.objective import PaperObjective
 from phytofit.paper.scouting import SCOUTING, scout
 from phytofit.reconstruct import reconstruct
-from phytofit.results.fit import Fit
+from phytofit.results import FittedPhytomer
 from phytofit.segmentation import segment
 
 __all__ = ["defaults", "recipe", "recipe_of"]
@@ -58,7 +58,7 @@ def recipe() -> dict[str, dict[str, Any]]:
     return {step: settings for step, settings in found.items() if settings}
 
 
-def recipe_of(result: Fit) -> dict[str, dict[str, Any]]:
+def recipe_of(result: FittedPhytomer) -> dict[str, dict[str, Any]]:
     """What made this result, no more: what `fit` was given or chose by itself, and the settings of the steps that its
     method uses."""
     steps = recipe()

@@ -22,7 +22,9 @@ class Trait:
     """One measured trait of one organ.
 
     ``rank`` counts leaves from the base, from 1; 0 for the stem.  ``low`` and ``high`` are the interval's ends, None
-    where the method gives none; ``method`` names how the value came about; ``flags`` are remarks in plain words.
+    where the method gives none; ``quality`` says how far to trust it: "good", "check" or "poor" (do not use), empty
+    where nothing is known; ``flags`` are the codes of the remarks that touch it; ``method`` names how the value came
+    about.
     """
 
     organ: str
@@ -32,8 +34,9 @@ class Trait:
     unit: str
     low: float | None = None
     high: float | None = None
-    method: str = ""
+    quality: str = ""
     flags: tuple[str, ...] = ()
+    method: str = ""
 
     @property
     def interval(self) -> str:
@@ -42,9 +45,7 @@ class Trait:
         return f"{low} – {high}" if low or high else ""
 
 
-def measure(
-    organs: Sequence[Organ], *, chord_cm: float = CHORD_CM, method: str = "", flags: tuple[str, ...] = ()
-) -> list[Trait]:
+def measure(organs: Sequence[Organ], *, chord_cm: float = CHORD_CM, method: str = "") -> list[Trait]:
     """The traits of a stem and its leaves.
 
     Parameters
@@ -70,22 +71,12 @@ def measure(
     assert all(leaf.kind == LEAF for leaf in leaves)
     lengths = stem.segment_lengths
     traits = [
-        Trait(
-            STEM,
-            0,
-            "stem_diameter",
-            _diameter_below(stem, leaves),
-            "cm",
-            None,
-            None,
-            method,
-            flags,
-        ),
-        Trait(STEM, 0, "stem_length", float(lengths.sum()), "cm", None, None, method, flags),
+        Trait(STEM, 0, "stem_diameter", _diameter_below(stem, leaves), "cm", method=method),
+        Trait(STEM, 0, "stem_length", float(lengths.sum()), "cm", method=method),
     ]
     for rank, leaf in enumerate(leaves, start=1):
         values = _leaf(stem, leaf, chord_cm)
-        traits += [Trait(LEAF, rank, name, value, unit, None, None, method, flags) for name, value, unit in values]
+        traits += [Trait(LEAF, rank, name, value, unit, method=method) for name, value, unit in values]
     return traits
 
 

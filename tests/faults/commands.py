@@ -54,7 +54,7 @@ class World:
             write_cloud(folder / f"{name}.ply", cloud)
         (folder / "view.png").touch()  # which makes it a folder of images, too
         (folder / "results").mkdir()
-        rows = [("a", 1, "leaf", 1, "leaf_length", 50.0, "cm", 48.0, 52.0, "likelihood", "")]
+        rows = [("a", 1, "leaf", 1, "leaf_length", 50.0, "cm", 48.0, 52.0, "good", "", "likelihood")]
         pd.DataFrame(rows, columns=COLUMNS).to_csv(folder / "results" / "traits.csv", index=False)
         for version in (0, 1):
             (folder / f"truth_{version}.csv").write_text(f"cloud,leaf_length_cm\na,{50 + version}.5\n")

@@ -80,7 +80,8 @@ def test_whatever_one_leaf_raises_the_others_go_on(world, folder, monkeypatch):
     table = pd.read_csv(folder / "out" / "traits.csv")
     lengths = table[table["trait"] == "leaf_length"]
     assert lengths["rank"].tolist() == [1, 2, 3]
-    assert "ValueError: it broke" in lengths["flags"].iloc[0]
+    assert lengths["flags"].iloc[0] == "not_fitted"
+    assert "leaf 1: not fitted: an internal error of phytofit, ValueError: it broke" in made.output
 
 
 def test_hostile_names_are_shown_stored_and_found_harmlessly(world, folder):

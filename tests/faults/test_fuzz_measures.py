@@ -17,8 +17,12 @@ GRID = [
     ["0007", "72,0", "NA", "1.234,5", "B"],
     ["Prüfglied 3", "51,25", "62", "", "C"],
 ]
-ROWS = ["cloud,plant,organ,rank,trait,value,unit,low,high,method,flags"]
-ROWS += [f"{name},1,leaf,{rank},leaf_area,{10.5 * rank},cm2,,{12.5 * rank},m,tip" for name in "ab" for rank in (1, 2)]
+ROWS = ["cloud,plant,organ,rank,trait,value,unit,low,high,quality,flags,method"]
+ROWS += [
+    f"{name},1,leaf,{rank},leaf_area,{10.5 * rank},cm2,,{12.5 * rank},check,tip_unseen,m"
+    for name in "ab"
+    for rank in (1, 2)
+]
 
 
 def joined(separator: str, end: str = "\r\n") -> str:

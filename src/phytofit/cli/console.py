@@ -244,8 +244,9 @@ def complain(error: Exception | str) -> None:
 
 
 def remark(kind: str, text: str) -> None:
-    """A note, which informs, or a flag, which says what to doubt."""
-    _line(out, f"{kind}: ", "" if kind == "note" else "bold yellow", at_command_line(text), logging.INFO)
+    """A note, which informs; a flag, or what to check, which says what to doubt; or what is poor, not to be used."""
+    style = {"note": "", "poor": "bold red"}.get(kind, "bold yellow")
+    _line(out, f"{kind}: ", style, at_command_line(text), logging.INFO)
 
 
 def say(text: str) -> None:

@@ -8,7 +8,7 @@ from phytofit.cli.console import command, results_in, say, show
 from phytofit.cli.fit import fit_in_view
 from phytofit.cli.options import OutOption, Seed
 from phytofit.cli.progress import Items
-from phytofit.cli.tables import print_remarks
+from phytofit.cli.tables import graded, print_remarks
 
 __all__ = ["demo_command"]
 
@@ -25,6 +25,7 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
     """
     from phytofit.cloud import read_cloud
     from phytofit.io import save_fit, save_simulated
+    from phytofit.results import Placed
     from phytofit.simulation import simulate
     from phytofit.species import load_species
     from phytofit.traits import measure
@@ -40,11 +41,11 @@ def demo_command(folder: OutOption = Path("demo"), seed: Seed = 7) -> None:
             result = fit_in_view(cloud, {"species": species, "seed": seed}, told)
         where = save_fit(result, cloud, folder)
         table = Table(title="Estimate beside truth")
-        for column in ("trait", "estimate", "95 % interval", "truth", "unit"):
-            table.add_column(column, justify="left" if column in ("trait", "unit") else "right")
+        for column in ("trait", "estimate", "95 % interval", "truth", "unit", "quality"):
+            table.add_column(column, justify="left" if column in ("trait", "unit", "quality") else "right")
         for estimate, truth in zip(result.traits, measure(made.organs), strict=True):
             numbers = (f"{estimate.value:.2f}", estimate.interval, f"{truth.value:.2f}")
-            table.add_row(estimate.name, *numbers, estimate.unit)
+            table.add_row(estimate.name, *numbers, estimate.unit, graded(estimate.quality))
         show(table)
-        print_remarks(result.notes, result.flags)
+        print_remarks(result.notes, map(Placed, result.remarks))
         say(f"The model on the points: {where / 'fit.png'}")

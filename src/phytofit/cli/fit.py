@@ -26,14 +26,14 @@ from phytofit.cli.options import (
 )
 from phytofit.cli.progress import Told
 from phytofit.cli.settings import defaults_of, entries_of
-from phytofit.cli.tables import print_remarks, print_skipped
+from phytofit.cli.tables import graded, print_remarks, print_skipped
 from phytofit.errors import SettingError
 from phytofit.text import for_terminal
 
 if TYPE_CHECKING:
     from phytofit.cloud import PointCloud
     from phytofit.paper.cross_entropy import Generation
-    from phytofit.results.fit import Fit
+    from phytofit.results import Fit, FittedPhytomer, PaperFit
 
 __all__ = ["fit_command", "fit_in_view"]
 
@@ -169,7 +169,7 @@ def fit_command(
         "threads": threads,
     }
 
-    def measured(path: Path, name: str, told: Told) -> "Fit":
+    def measured(path: Path, name: str, told: Told) -> "Fit | PaperFit":
         cloud = read_quietly(path, units, None if labels == "none" else labels)
         result = fit_in_view(cloud, settings, told)
         save_fit(result, cloud, folder, name, meshes=meshes or (), convergence=convergence)
@@ -193,7 +193,7 @@ def _seed_points(given: list[str], n_clouds: int) -> list[list[float]] | None:
     return points or None
 
 
-def fit_in_view(cloud: "PointCloud", settings: dict[str, Any], told: Told) -> "Fit":
+def fit_in_view(cloud: "PointCloud", settings: dict[str, Any], told: Told) -> "Fit | PaperFit":
     """The fit of a cloud, which tells how far it is."""
     from phytofit.fitting import fit
 
@@ -209,21 +209,14 @@ def fit_in_view(cloud: "PointCloud", settings: dict[str, Any], told: Told) -> "F
     return fit(cloud, progress=searched, **settings)
 
 
-def _print_fit(result: "Fit", name: str, where: Path) -> None:
+def _print_fit(result: "FittedPhytomer", name: str, where: Path) -> None:
+    from phytofit.results import Placed
+
     table = Table(title=for_terminal(name))
-    for column in ("organ", "trait", "value", "95 % interval", "unit"):
+    for column in ("organ", "trait", "value", "95 % interval", "unit", "quality"):
         table.add_column(column, justify="right" if column in ("value", "95 % interval") else "left")
     for trait in result.traits:
-        table.add_row(trait.organ, trait.name, f"{trait.value:.2f}", trait.interval, trait.unit)
+        table.add_row(trait.organ, trait.name, f"{trait.value:.2f}", trait.interval, trait.unit, graded(trait.quality))
     show(table)
-    print_remarks(result.notes, result.flags)
-    unit = "relative" if result.relative else "cm"
-    if result.estimate is None:
-        said = f"{result.settings['distance']} distance {result.error:.2f} {unit}"
-    else:
-        stem, leaf, thickness = result.estimate.noise * result.scale
-        said = (
-            f"noise {stem:.2f} {unit} on the stem, {leaf:.2f} on the leaf, {thickness:.2f} more across it; "
-            f"{100 * result.estimate.share[2]:.0f} % outliers"
-        )
-    say(f"{said}; model on the points: {where / 'fit.png'}")
+    print_remarks(result.notes, map(Placed, result.remarks))
+    say(f"{result.closeness}; model on the points: {where / 'fit.png'}")

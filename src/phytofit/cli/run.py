@@ -32,7 +32,7 @@ from phytofit.cli.options import (
 )
 from phytofit.cli.progress import Items
 from phytofit.cli.settings import defaults_of
-from phytofit.cli.tables import print_remarks, print_skipped
+from phytofit.cli.tables import MARKS, print_remarks, print_skipped
 from phytofit.errors import InputError, PhytofitError
 
 if TYPE_CHECKING:
@@ -204,7 +204,8 @@ def _print_plant(made: "PlantRun") -> None:
             of_leaf = leaf.drop_duplicates("trait").set_index("trait")
             table.add_row(str(rank), *(_with_interval(of_leaf, trait) for trait in SHOWN))
         show(table)
-    print_remarks(made.notes, made.flags)
+    say(f"{MARKS['check']} check; {MARKS['poor']} poor: do not use")
+    print_remarks(made.notes, made.remarks)
     if made.skipped:
         say(f"up to date, skipped: {', '.join(made.skipped)}")
 
@@ -214,4 +215,5 @@ def _with_interval(traits: "pd.DataFrame", name: str) -> str:
         return ""
     value, low, high = (traits[column].to_dict()[name] for column in ("value", "low", "high"))
     ends = ["" if math.isnan(end) else f"{end:.1f}" for end in (low, high)]
-    return f"{value:.1f}" + (f" ({ends[0]}–{ends[1]})" if any(ends) else "")
+    mark = MARKS.get(traits["quality"].to_dict()[name], "")
+    return f"{value:.1f}" + (f" ({ends[0]}–{ends[1]})" if any(ends) else "") + f" {mark}".rstrip()

@@ -79,6 +79,8 @@ def _print_plants(results: "list[Segmentation]", name: str, where: Path) -> None
 
 
 def _print_leaves(result: "Segmentation", name: str, where: Path) -> None:
+    from phytofit.results import Placed, of_codes
+
     unit = "rel" if result.cloud.unit == "none" else "cm"
     table = Table(title=for_terminal(f"{name}: {len(result.leaves)} leaves"))
     for column in ("leaf", f"collar along the stem, {unit}", f"length, {unit}", "azimuth, deg", "points"):
@@ -87,6 +89,6 @@ def _print_leaves(result: "Segmentation", name: str, where: Path) -> None:
         numbers = (f"{leaf.collar_distance:.1f}", f"{leaf.length:.1f}", f"{leaf.azimuth:.0f}", str(leaf.n_points))
         table.add_row(str(leaf.rank), *numbers)
     show(table)
-    flags = [f"leaf {leaf.rank}: {flag}" for leaf in result.leaves for flag in leaf.flags]
-    print_remarks((*result.cloud.notes, *result.notes), flags)
+    found = [Placed(one, rank=leaf.rank) for leaf in result.leaves for one in of_codes(leaf.flags)]
+    print_remarks((*result.cloud.notes, *result.notes), found)
     say(f"Look at {where / 'segmentation.png'}")

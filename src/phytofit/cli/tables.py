@@ -1,27 +1,36 @@
 """What several commands print of results."""
 
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.text import Text
 
 from phytofit.cli.console import remark
 
-__all__ = ["print_remarks", "print_skipped"]
+if TYPE_CHECKING:
+    from phytofit.results import Placed
+
+__all__ = ["MARKS", "graded", "print_remarks", "print_skipped"]
 
 NAMED = 3  # so many of the files that were skipped are named
-OF_LEAF = re.compile(r"leaf (\d+): (.*)", re.DOTALL)
+STYLES = {"good": "green", "check": "yellow", "poor": "bold red"}  # of a quality
+MARKS = {"check": "?", "poor": "!"}  # behind a value; those without are good, or nothing is known of them
 
 
-def print_remarks(notes: Iterable[str], flags: Iterable[str]) -> None:
-    """Each remark once, with all the leaves that it is about."""
-    for kind, texts in (("note", notes), ("flag", flags)):
-        leaves: dict[str, list[str]] = {}
-        for text in texts:
-            found = OF_LEAF.fullmatch(text)
-            leaves.setdefault(found[2] if found else text, []).extend([found[1]] if found else [])
-        for text, ranks in leaves.items():
-            of = f"{'leaf' if len(ranks) == 1 else 'leaves'} {', '.join(ranks)}: " if ranks else ""
-            remark(kind, f"{of}{text}")
+def graded(quality: str) -> Text:
+    """The quality of a trait, in its colour."""
+    return Text(quality, STYLES.get(quality, ""))
+
+
+def print_remarks(notes: Iterable[str], remarks: "Iterable[Placed]") -> None:
+    """Each note and each remark once, with all the leaves that it is on; the worst first."""
+    from phytofit.results import grouped
+
+    for text in dict.fromkeys(notes):
+        remark("note", text)
+    for grade, line in grouped(remarks):
+        remark(grade, line)
 
 
 def print_skipped(files: Sequence[Path]) -> None:

@@ -254,4 +254,8 @@ def _show(found: "Sequence[Agreement]", title: str) -> None:
     for name, row in zip(shown.index, shown[list(SHOWN)].to_numpy(), strict=True):
         table.add_row(str(name), *row)
     show(table)
-    say(f"{sum(a.flagged for a in found)} of {sum(a.n for a in found)} values are flagged")
+    graded = [sum(numbers) for numbers in zip(*((a.n, a.good, a.check, a.poor) for a in found), strict=True)]
+    if any(graded[1:]):
+        say("of {} values, {} are good, {} to be checked, {} poor: do not use".format(*graded))
+    else:
+        say("the results do not say how good they are: they are of an earlier version of phytofit")

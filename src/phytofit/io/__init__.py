@@ -3,7 +3,15 @@
 from phytofit.io.files import OURS, files_made, is_our_picture, json_text, result_names, write_text
 from phytofit.io.log import LOG, open_log
 from phytofit.io.models import MESHES, check_meshes, write_mesh
-from phytofit.io.phytomer import COLUMNS, fit_tables, save_fit, trait_table
+from phytofit.io.phytomer import (
+    COLUMNS,
+    SEPARATOR,
+    fit_tables,
+    read_remarks,
+    remarks_text,
+    save_fit,
+    trait_table,
+)
 from phytofit.io.plant import (
     check_reconstruction,
     leaf_table,
@@ -39,6 +47,7 @@ __all__ = [
     "LOG",
     "MESHES",
     "OURS",
+    "SEPARATOR",
     "FolderTable",
     "check_made",
     "check_meshes",
@@ -55,8 +64,10 @@ __all__ = [
     "made_in",
     "open_log",
     "prepare_folder",
+    "read_remarks",
     "read_segmentation",
     "read_table",
+    "remarks_text",
     "result_names",
     "save_fit",
     "save_plants",

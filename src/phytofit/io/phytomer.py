@@ -1,6 +1,7 @@
 """What a fit looks like on disk: one folder a cloud, and a tidy table."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -9,20 +10,22 @@ import numpy as np
 import pandas as pd
 
 from phytofit.cloud import PointCloud
-from phytofit.errors import NoPhytomerError, OutputError
+from phytofit.errors import InputError, NoPhytomerError, OutputError
 from phytofit.io.files import files_made, input_of, json_text
 from phytofit.io.models import write_mesh
 from phytofit.io.replacing import whole_folder
 from phytofit.io.tables import FolderTable, write_table
 from phytofit.plots import plot_convergence, plot_fit
 from phytofit.recipe import recipe_of
-from phytofit.results.fit import Fit
+from phytofit.results import FittedPhytomer, Remark
+from phytofit.small_files import read_json
 from phytofit.text import for_file_name
 from phytofit.traits import Trait
 
-__all__ = ["COLUMNS", "fit_tables", "save_fit", "trait_table"]
+__all__ = ["COLUMNS", "SEPARATOR", "fit_tables", "read_remarks", "remarks_text", "save_fit", "trait_table"]
 
-COLUMNS = ["cloud", "plant", "organ", "rank", "trait", "value", "unit", "low", "high", "method", "flags"]
+COLUMNS = ["cloud", "plant", "organ", "rank", "trait", "value", "unit", "low", "high", "quality", "flags", "method"]
+SEPARATOR = ";"  # of flags
 
 
 def trait_table(name: str, traits: Iterable[Trait], *, plant: int = 1) -> pd.DataFrame:
@@ -31,8 +34,8 @@ def trait_table(name: str, traits: Iterable[Trait], *, plant: int = 1) -> pd.Dat
     `name` is the cloud's; `plant` the number of the plant in it, from 1, where a cloud holds several.
     """
     rows = [
-        (name, plant, t.organ, t.rank, t.name, t.value, t.unit, t.low, t.high, t.method, "; ".join(t.flags))
-        for t in traits
+        (name, plant, t.organ, t.rank, t.name, t.value, t.unit, t.low, t.high, t.quality, codes, t.method)
+        for t, codes in ((t, SEPARATOR.join(t.flags)) for t in traits)
     ]
     return pd.DataFrame(rows, columns=COLUMNS).astype({"low": float, "high": float})
 
@@ -45,7 +48,7 @@ def fit_tables(folder: Path) -> FolderTable:
 
 
 def save_fit(
-    result: Fit,
+    result: FittedPhytomer,
     cloud: PointCloud,
     folder: str | Path,
     name: str | None = None,
@@ -75,7 +78,22 @@ def save_fit(
     return Path(folder) / name
 
 
-def _check_finite(result: Fit) -> None:
+def remarks_text(remarks: Iterable[Remark]) -> str:
+    """Remarks as JSON, in the form in which ``fit.json`` has them."""
+    return json_text({"remarks": [asdict(one) for one in remarks]})
+
+
+def read_remarks(file: Path) -> list[Remark]:
+    """The remarks in a file that has them as ``fit.json`` does; InputError if it has none, or can't be read."""
+    expected = "the remarks of a fit, as phytofit writes them"
+    said = read_json(file, expected)
+    try:
+        return [Remark(**{**one, "traits": tuple(one["traits"])}) for one in said["remarks"]]
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{file}: expected {expected} ({type(error).__name__}: {error})") from None
+
+
+def _check_finite(result: FittedPhytomer) -> None:
     """NoPhytomerError where the fit is no phytomer of this world."""
     ends = [(t.name, end) for t in result.traits for end in (t.value, t.low, t.high) if end is not None]
     for what, value in (*ends, *result.parameters.items(), ("error", result.error)):
@@ -83,11 +101,10 @@ def _check_finite(result: Fit) -> None:
             raise NoPhytomerError(f"its {what.replace('_', ' ')} came out as {value}, not a number: look at the cloud")
 
 
-def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
+def _as_json(result: FittedPhytomer, cloud: PointCloud, name: str) -> dict[str, Any]:
     """What fit.json holds; no times, so that the same run gives the same bytes."""
     space = result.species.space
     intervals = result.parameter_intervals
-    traits = trait_table(name, result.traits).drop(columns=["cloud", "plant", "flags"]).replace({np.nan: None})
     return {
         "phytofit": version("phytofit"),
         "cloud": name,
@@ -100,17 +117,17 @@ def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
         "model": type(result.species.model).__name__,
         "method": result.method,
         "status": result.status.value,
-        "flags": list(result.flags),
         "notes": list(result.notes),
         "parameters": {
             p: dict(zip(("value", "low", "high"), (value, *intervals.get(p, (None, None))), strict=True))
-            | {"unit": _unit(unit, result)}
+            | {"unit": result.length_unit if unit == "cm" else unit}
             for (p, value), unit in zip(result.parameters.items(), space.units, strict=True)
         },
-        "traits": traits.to_dict(orient="records"),
+        "traits": [_trait(trait) for trait in result.traits],
+        "remarks": [asdict(one) for one in result.remarks],
         "error": result.error,
         "pose": result.pose.tolist(),
-        **_how_it_ended(result),
+        **result.details,
         "history": [
             {
                 "generation": g.index,
@@ -127,33 +144,10 @@ def _as_json(result: Fit, cloud: PointCloud, name: str) -> dict[str, Any]:
     }
 
 
-def _how_it_ended(result: Fit) -> dict[str, Any]:
-    """What only one of the methods has: the registration of the paper's, the noise and shares of the likelihood's."""
-    if result.registration is not None:
-        ended = result.registration
-        return {
-            "registration": {"rmse": ended.rmse, "iterations": ended.iterations, "converged": ended.converged},
-        }
-    assert result.estimate is not None
-    made = result.estimate
-    noise = made.noise * result.scale
-    return {
-        "noise": dict(zip(("stem", "leaf", "leaf_thickness"), noise.tolist(), strict=True)),
-        "share": dict(zip(("stem", "leaf", "outliers"), made.share.tolist(), strict=True)),
-        "midrib_seen": made.seen,
-        "tip_seen": made.tip_seen,
-        "leaf_ends_at": made.ends_at,
-        "correlated_cm": made.correlated_cm,
-        "evidence": made.evidence,
-        "variance_inflation": made.inflation,
-        "covariance": result.covariance.tolist(),
-        "trait_covariance": None if result.trait_covariance is None else result.trait_covariance.tolist(),
-    }
+def _trait(trait: Trait) -> dict[str, Any]:
+    said = asdict(trait)
+    return {"organ": said.pop("organ"), "rank": said.pop("rank"), "trait": said.pop("name"), **said}
 
 
 def _finite(bound: float) -> float | None:
     return bound if np.isfinite(bound) else None
-
-
-def _unit(unit: str, result: Fit) -> str:
-    return "rel" if result.relative and unit == "cm" else unit

@@ -177,7 +177,7 @@ def leaf_table(name: str, result: Segmentation, *, plant: int = 1) -> pd.DataFra
             f"collar_height_{unit}": leaf.collar_height,
             f"length_{unit}": leaf.length,
             "n_points": leaf.n_points,
-            "flags": "; ".join(leaf.flags),
+            "flags": ";".join(leaf.flags),
         }
         for leaf in result.leaves
     ]

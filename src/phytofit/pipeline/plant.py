@@ -25,8 +25,10 @@ from phytofit.io import (
     delete_made,
     is_our_picture,
     prepare_folder,
+    read_remarks,
     read_segmentation,
     read_table,
+    remarks_text,
     save_fit,
     save_reconstruction,
     save_segmentation,
@@ -34,12 +36,14 @@ from phytofit.io import (
     whole_file,
     whole_folder,
     write_table,
+    write_text,
 )
 from phytofit.pipeline.stages import KEY, done, is_edited, key_of, up_to_date
 from phytofit.pipeline.traits import by_its_points, of_leaf, plant_traits
 from phytofit.plots import plot_plant, plot_plants
 from phytofit.recipe import recipe
 from phytofit.reconstruct import depth_files, reconstruct
+from phytofit.results import Fit, Placed, grouped, of_codes, remark
 from phytofit.segmentation import PLANT_CM, Segmentation, SegmentedLeaf, numbering, segment, separate_plants
 from phytofit.small_files import read_json
 from phytofit.species import Species, load_species
@@ -49,6 +53,7 @@ __all__ = ["PlantRun", "run"]
 
 MOST_OUTLIERS = 0.5  # share of a phytomer's points, beyond which what was fitted is not the leaf
 MADE = ("plant.ply", "segmentation.json")  # of a segmentation: what says whether it is up to date
+REMARKS = "remarks.json"  # of a leaf that could not be fitted
 RECONSTRUCTION = "what phytofit reconstruct writes"
 Progress = Callable[[str, int, int], None]
 
@@ -56,24 +61,26 @@ Progress = Callable[[str, int, int], None]
 @dataclass(frozen=True, repr=False)
 class PlantRun(Shown):
     """What became of a plant, or of several in one cloud: ``table`` of their traits (the columns of ``traits.csv``),
-    their ``segmentations`` in the order of the table's column ``plant``, ``flags`` in plain words, ``notes`` on what
-    was done to the cloud, and which stages were ``skipped``, being up to date."""
+    their ``segmentations`` in the order of the table's column ``plant``, ``remarks`` on them, ``notes`` on what was
+    done to the cloud, and which stages were ``skipped``, being up to date."""
 
     table: pd.DataFrame
     segmentations: tuple[Segmentation, ...]
-    flags: tuple[str, ...]
+    remarks: tuple[Placed, ...]
     notes: tuple[str, ...]
     skipped: tuple[str, ...]
 
     def summary(self) -> Summary:
-        """The traits of each plant and of its leaves, and the flags."""
-        columns = ["plant", "organ", "rank", "trait", "value", "unit"]
+        """The traits of each plant and of its leaves, and the remarks."""
+        columns = ["plant", "organ", "rank", "trait", "value", "unit", "quality"]
         cells = self.table[columns].to_numpy().tolist()
-        rows = [[str(n), organ, str(rank or ""), trait, f"{value:.2f}", u] for n, organ, rank, trait, value, u in cells]
+        rows = [
+            [str(n), organ, str(rank or ""), name, f"{v:.2f}", *others] for n, organ, rank, name, v, *others in cells
+        ]
         n_leaves = " and ".join(str(len(found.leaves)) for found in self.segmentations)
         title = f"{self.segmentations[0].cloud.name}: {n_leaves} leaves"
-        head = ("plant", "organ", "leaf", "trait", "value", "unit")
-        return Summary(title, head, rows, [f"flag: {flag}" for flag in self.flags])
+        head = ("plant", "organ", "leaf", "trait", "value", "unit", "quality")
+        return Summary(title, head, rows, [f"{grade}: {line}" for grade, line in grouped(self.remarks)])
 
     def to_frame(self) -> pd.DataFrame:
         """All traits as a table, with the columns of ``traits.csv``."""
@@ -148,7 +155,7 @@ def run(
     for file, picture in pictures.items():
         with whole_file(folder / file) as part:
             picture.savefig(part, dpi=150, format="png", metadata=OURS)
-    return PlantRun(whole, tuple(found), tuple(log.flags), tuple(dict.fromkeys(log.notes)), tuple(log.skipped))
+    return PlantRun(whole, tuple(found), tuple(log.remarks), tuple(dict.fromkeys(log.notes)), tuple(log.skipped))
 
 
 @dataclass(frozen=True)
@@ -156,7 +163,7 @@ class _Log:
     """What happens on the way."""
 
     progress: Progress
-    flags: list[str] = field(default_factory=list)
+    remarks: list[Placed] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
 
@@ -164,12 +171,17 @@ class _Log:
 @dataclass(frozen=True)
 class _Plant:
     """One of the plants of a cloud, numbered from 1; ``place`` is the folder of its stages, ``called`` what comes
-    before remarks on it: nothing where it is the only one."""
+    before notes on it: nothing where it is the only one."""
 
     number: int
     place: Path
     called: str
     found: Segmentation
+
+    @property
+    def in_remarks(self) -> int:
+        """Its number where there are several, else 0."""
+        return self.number if self.called else 0
 
 
 def _prepare(folder: Path) -> None:
@@ -204,7 +216,8 @@ def _reconstructed(source: Path, folder: Path, how: Mapping[str, Any], log: _Log
         done(target, key, ("plant.ply", "reconstruction.json"))
     said = read_json(target / "reconstruction.json", RECONSTRUCTION)
     log.notes.extend(said["notes"])
-    log.flags.extend([*said["flags"], *(f"{v['file']} left out: {v['reason']}" for v in said["rejected"])])
+    of_views = [*said["flags"], *(f"{v['file']} left out: {v['reason']}" for v in said["rejected"])]
+    log.remarks.extend(Placed(remark("views", said=text)) for text in of_views)
     return target / "plant.ply"
 
 
@@ -273,8 +286,8 @@ def _plants(found: Sequence[Segmentation], folder: Path, log: _Log) -> list[_Pla
         log.notes.append(numbering(np.array([one.stem_path[0] for one in found])))
     for plant in plants:
         log.notes.extend(f"{plant.called}{note}" for note in plant.found.notes)
-        flags = ((leaf.rank, flag) for leaf in plant.found.leaves for flag in leaf.flags)
-        log.flags.extend(f"{plant.called}leaf {rank}: {flag}" for rank, flag in flags)
+        for leaf in plant.found.leaves:
+            log.remarks.extend(Placed(one, plant.in_remarks, leaf.rank) for one in of_codes(leaf.flags))
     return plants
 
 
@@ -302,7 +315,7 @@ def _measured(
         for leaf, phytomer in zip(plant.found.leaves, plant.found.phytomers(), strict=True):
             log.progress("fit", n_done, n_leaves)
             table = _fitted(plant, leaf, phytomer, species, how, meshes, log)
-            tables.append(of_leaf(table, name, plant.number, leaf.rank))
+            tables.append(of_leaf(table, name, plant.number, leaf))
             n_done += 1
     log.progress("fit", n_leaves, n_leaves)
     return tables
@@ -328,12 +341,12 @@ def _fitted(
     else:
         try:
             fitted = fit(phytomer, species=species, up=plant.found.up, **how)
-            assert fitted.estimate is not None
+            assert isinstance(fitted, Fit)
             outliers = float(fitted.estimate.share[2])
             if outliers > MOST_OUTLIERS:
                 raise NoPhytomerError(f"the model does not explain {100 * outliers:.0f} % of the points")
             save_fit(fitted, phytomer, target.parent, name, meshes=meshes)
-            done(target, key, ("traits.csv",))
+            done(target, key, ("traits.csv", "fit.json"))
         except (NoPhytomerError, CloudError) as error:
             _save_by_points(plant, leaf, str(error), target, key)
         except PhytofitError:
@@ -343,8 +356,8 @@ def _fitted(
             reason = f"an internal error of phytofit, {type(error).__name__}: {one_line(error)}"
             _save_by_points(plant, leaf, reason, target, key_of(name, [], {"fault": reason}))  # to be tried again
     table = read_table(target / "traits.csv")
-    flags = "; ".join(table["flags"].dropna()).split("; ")
-    log.flags.extend(f"{plant.called}leaf {leaf.rank}: {flag}" for flag in dict.fromkeys(flags) if flag)
+    said = next(file for name in ("fit.json", REMARKS) if (file := target / name).is_file())
+    log.remarks.extend(Placed(one, plant.in_remarks, leaf.rank) for one in read_remarks(said))
     return table
 
 
@@ -357,6 +370,8 @@ def _content(species: Species) -> dict[str, Any]:
 def _save_by_points(plant: _Plant, leaf: SegmentedLeaf, reason: str, target: Path, key: Mapping[str, Any]) -> None:
     """In place of a fit, the length of a leaf along its points."""
     with whole_folder(target.parent, target.name, KEY, "fit.json") as part:
-        trait = by_its_points(plant.found, leaf, reason)
-        write_table(part / "traits.csv", trait_table(plant.found.cloud.name, [trait], plant=plant.number))
-        done(part, key, ("traits.csv",))
+        why = remark("not_fitted", reason=one_line(reason))
+        traits = by_its_points(plant.found, leaf, why)
+        write_table(part / "traits.csv", trait_table(plant.found.cloud.name, traits, plant=plant.number))
+        write_text(part / REMARKS, remarks_text([why]))
+        done(part, key, ("traits.csv", REMARKS))

@@ -3,7 +3,6 @@
 Widths of text are those of its outlines, which no screen and no resolution changes.
 """
 
-import re
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,8 +20,28 @@ from matplotlib.textpath import text_to_path
 from phytofit.text import for_picture, one_line
 
 __all__ = [
-    "CELL_IN", "GREY", "INK", "LARGE", "MARGIN_IN", "NORMAL", "PAGE_IN", "SMALL", "SPACE_IN", "Legend",
-    "Line", "Page", "Table", "digits", "figures", "fitting", "folded", "in_short", "interval", "number", "width_in",
+    "CELL_IN",
+    "GREY",
+    "INK",
+    "LARGE",
+    "MARGIN_IN",
+    "NORMAL",
+    "PAGE_IN",
+    "QUALITY",
+    "SMALL",
+    "SPACE_IN",
+    "Legend",
+    "Line",
+    "Page",
+    "Table",
+    "digits",
+    "figures",
+    "fitting",
+    "folded",
+    "interval",
+    "number",
+    "quality_legend",
+    "width_in",
 ]  # fmt: skip
 
 PAGE_IN = 10.0  # width: where a page is shown 800 pixels wide, a point of type is 1.1 pixels
@@ -34,6 +53,12 @@ CELL_IN = 0.06  # above, below and beside what stands in a cell
 MARK_WIDE_IN = 0.12  # of the mark of a table's row
 MARK_IN, GAP_IN, ROW_IN = 0.36, 0.22, 0.19  # of a legend: a mark, what parts one entry from the next, and a row
 INK, GREY, RULE = "#1A1A1A", "#555555", "#BBBBBB"
+QUALITY = {  # how far to trust a value: a mark, and a colour that the colour-blind tell from the others
+    "good": ("●", "#00704A"),
+    "check": ("▲", "#B45F00"),
+    "poor": ("✖", "#A3003C"),
+}
+MEANING = {"good": "good", "check": "check", "poor": "poor: do not use"}
 ELLIPSIS = "…"
 MOST_DIGITS = 6
 
@@ -172,6 +197,11 @@ class Legend:
             ax.text(at + MARK_IN, y, text, fontsize=SMALL, color=INK, ha="left", va="center_baseline")
 
 
+def quality_legend() -> list[Line]:
+    """What the marks of the qualities say, each in its colour."""
+    return [Line(f"{mark} {MEANING[quality]}", color=color) for quality, (mark, color) in QUALITY.items()]
+
+
 def width_in(text: str, size: float = SMALL, *, bold: bool = False) -> float:
     """Width of a line of text, inches."""
     return float(text_to_path.get_text_width_height_descent(text, _font(size, bold), False)[0]) / 72.0
@@ -207,14 +237,6 @@ def folded(text: object, width: float, most: int, size: float = SMALL, *, bold: 
         lines.append(fitting(" ".join(words[:n]), width, size, bold=bold))
         words = words[n:]
     return lines
-
-
-def in_short(remark: str) -> str:
-    """What a remark says was seen, without brackets and what follows from it; a clause of two words takes the next
-    along."""
-    clauses = re.split(r"(?<=[:;.])\s+", re.sub(r"\s*\([^()]*\)", "", remark).strip())
-    kept = " ".join(clauses[: 2 if len(clauses[0].split()) <= 2 else 1])
-    return kept.rstrip(":;.")
 
 
 def digits(value: float, low: float | None, high: float | None) -> int:

@@ -17,6 +17,7 @@ from phytofit.plots.page import (
     MARGIN_IN,
     NORMAL,
     PAGE_IN,
+    QUALITY,
     SMALL,
     SPACE_IN,
     Legend,
@@ -28,9 +29,11 @@ from phytofit.plots.page import (
     folded,
     interval,
     number,
+    quality_legend,
+    width_in,
 )
 from phytofit.plots.views import Panel, View, arranged, widest_side
-from phytofit.results.fit import Fit
+from phytofit.results import Fit, FittedPhytomer, Placed, grouped
 from phytofit.traits import CHORD_CM, Trait, leaves_stem_at
 
 __all__ = ["plot_convergence", "plot_fit"]
@@ -41,13 +44,14 @@ STEM_FILL, STEM_EDGE = "#DDAA66", "#8A4B08"  # told apart from the leaf's by the
 LEAF_FILL, LEAF_EDGE = "#CDEBDA", "#1B7A4B"
 MEASURE, SPREAD = "#0B3FA0", "#C5D3EC"
 TABLE_IN = 3.4  # width of the table and of what stands below it
-COLUMNS_IN = (1.2, 1.05, 1.15)
+COLUMNS_IN = (1.1, 0.98, 1.1, 0.22)
 HIGHEST_IN = 7.0  # of the views
 DOTTED = 0.35  # dots, as a share of the room that the cloud takes up: the model is seen behind them
 LEAST_LENGTH = 1e-9  # of the midrib, outside the stem: less is rounding
 ARC_IN = 0.4  # radius of the angle's arc
 STEEPEST_DEG = 60.0  # of the view onto the blade: from higher up it would not show which way is up
 MOST_LINES = 4  # of a remark
+MARK_IN, KEY_IN = 0.17, 0.24  # width of the mark before a remark; height of the row that says what the marks say
 SHOWN = {
     "leaf_length": "leaf length",
     "leaf_angle": "leaf angle",
@@ -57,7 +61,7 @@ SHOWN = {
 }
 
 
-def plot_fit(result: Fit, title: str = "") -> Figure:
+def plot_fit(result: FittedPhytomer, title: str = "") -> Figure:
     """The cloud and the fitted model, upright, from the side and facing the blade, with the length, angle, width and
     diameter that were measured; beside them the table of traits, and what to check."""
     stem, leaf = result.organs
@@ -67,17 +71,20 @@ def plot_fit(result: Fit, title: str = "") -> Figure:
     room = PAGE_IN - TABLE_IN - 3.0 * MARGIN_IN
     traits = {trait.name: trait for trait in result.traits}
     text, table, remarks = _heading(result, title), _table(traits), _remarks(result)
-    beside = sum(line.height for line in (*text, *remarks)) + table.height + 2.0 * SPACE_IN
+    said = [line for _, lines in remarks for line in lines]
+    beside = sum(line.height for line in (*text, *said)) + table.height + 2.0 * SPACE_IN + KEY_IN
     legend = Legend(_marks(result), room)
     drawn = np.concatenate([result.reference, _outline(stem), _outline(leaf)])
     shown = arranged(views, drawn, room, max(HIGHEST_IN, beside - legend.height))
     page = Page(max(beside, shown.height + legend.height) + 2.0 * MARGIN_IN)
     left = 2.0 * MARGIN_IN + room
     top = page.write_all(left, MARGIN_IN, text) + SPACE_IN
-    top = table.draw(page, left, top) + SPACE_IN
-    page.write_all(left, top, remarks)
+    top = _draw_key(page, left, table.draw(page, left, top)) + SPACE_IN
+    for mark, lines in remarks:
+        page.write(left, top, mark)
+        top = page.write_all(left + MARK_IN, top, lines)
     at = MARGIN_IN + 0.5 * (room - shown.width)
-    panels = shown.panels(page, at, MARGIN_IN, "rel" if result.relative else "cm")
+    panels = shown.panels(page, at, MARGIN_IN, result.length_unit)
     for panel in panels:
         panel.up_arrow(stem.axis[0], up)
         _draw_model(panel, result)
@@ -86,7 +93,7 @@ def plot_fit(result: Fit, title: str = "") -> Figure:
     return page.figure
 
 
-def _heading(result: Fit, title: str) -> list[Line]:
+def _heading(result: FittedPhytomer, title: str) -> list[Line]:
     lines = [Line(text, LARGE, bold=True) for text in folded(title, TABLE_IN, 2, LARGE, bold=True)]
     said = f"{len(result.reference):,} points, fitted by the method “{result.method}”"
     if result.relative:
@@ -96,7 +103,7 @@ def _heading(result: Fit, title: str) -> list[Line]:
 
 def _table(traits: dict[str, Trait]) -> Table:
     """The traits with their intervals."""
-    rows = [tuple((Line(text, color=GREY),) for text in ("trait", "value", "95 % interval"))]
+    rows = [tuple((Line(text, color=GREY),) for text in ("trait", "value", "95 % interval", ""))]
     for name, said in SHOWN.items():
         trait = traits[name]
         decimals = digits(trait.value, trait.low, trait.high)
@@ -104,21 +111,30 @@ def _table(traits: dict[str, Trait]) -> Table:
         value = number(trait.value, decimals) + unit
         ends = interval(trait.low, trait.high, decimals) or "not given"
         cells = figures(value, COLUMNS_IN[1] - 2.0 * CELL_IN, bold=True), figures(ends, COLUMNS_IN[2] - 2.0 * CELL_IN)
-        rows.append(((Line(said, NORMAL),), (cells[0],), (cells[1],)))
-    return Table(COLUMNS_IN, ("left", "right", "right"), tuple(rows))
+        mark, color = QUALITY.get(trait.quality, ("", INK))
+        rows.append(((Line(said, NORMAL),), (cells[0],), (cells[1],), (Line(mark, NORMAL, color=color),)))
+    return Table(COLUMNS_IN, ("left", "right", "right", "center"), tuple(rows))
 
 
-def _remarks(result: Fit) -> list[Line]:
-    if not result.flags:
-        return [Line("Nothing to check: no flag.", color=GREY)]
-    lines = [Line("To check", NORMAL, bold=True)]
-    for flag in result.flags:
-        first, *others = folded(f"• {flag}", TABLE_IN, MOST_LINES)
-        lines += [Line(first), *(Line(f"   {other}") for other in others)]
-    return lines
+def _draw_key(page: Page, left: float, top: float) -> float:
+    """What the marks behind the traits say, in a row; where what follows may begin."""
+    at = left + CELL_IN
+    for line in quality_legend():
+        page.write(at, top + CELL_IN, line)
+        at += width_in(line.text) + 2.0 * MARK_IN
+    return top + KEY_IN
 
 
-def _marks(result: Fit) -> tuple[tuple[str, str, str], ...]:
+def _remarks(result: FittedPhytomer) -> list[tuple[Line, list[Line]]]:
+    """What was noticed, the worst first: for each remark its mark, and lines."""
+    lines = []
+    for grade, said in grouped(map(Placed, result.remarks)):
+        mark, color = QUALITY.get(grade, ("•", INK))
+        lines.append((Line(mark, color=color), [Line(text) for text in folded(said, TABLE_IN - MARK_IN, MOST_LINES)]))
+    return lines or [(Line(""), [Line("Nothing to check.", color=GREY)])]
+
+
+def _marks(result: FittedPhytomer) -> tuple[tuple[str, str, str], ...]:
     """The legend of the views."""
     marks = [
         ("dot", POINTS, "cloud"),
@@ -126,7 +142,7 @@ def _marks(result: Fit) -> tuple[tuple[str, str, str], ...]:
         ("area", LEAF_FILL, "fitted leaf"),
         ("line", MEASURE, "what was measured"),
     ]
-    if result.estimate is not None and result.estimate.seen < 1.0:
+    if result.midrib_seen < 1.0:
         marks.append(("dashed", MEASURE, "not seen"))
     return tuple(marks)
 
@@ -150,7 +166,7 @@ def _outline(organ: Organ) -> FloatArray:
     return np.asarray(mesh([organ], n_around=32).vertices)
 
 
-def _draw_model(panel: Panel, result: Fit) -> None:
+def _draw_model(panel: Panel, result: FittedPhytomer) -> None:
     """Stem and leaf, the points on them, and their edges."""
     for organ, fill, zorder in zip(result.organs, (STEM_FILL, LEAF_FILL), (1.0, 1.5), strict=True):
         surface = mesh([organ], n_around=32)
@@ -164,7 +180,7 @@ def _draw_model(panel: Panel, result: Fit) -> None:
         panel.line(leaf.axis + sign * leaf.half_width[:, np.newaxis] * lateral, LEAF_EDGE, 1.0, zorder=3.0)
 
 
-def _draw_measures(side: Panel, facing: Panel, result: Fit, traits: dict[str, Trait]) -> None:
+def _draw_measures(side: Panel, facing: Panel, result: FittedPhytomer, traits: dict[str, Trait]) -> None:
     """What was measured, drawn and named where it shows: length, angle and diameter from the side, width facing the
     blade."""
     stem, leaf = result.organs
@@ -174,7 +190,7 @@ def _draw_measures(side: Panel, facing: Panel, result: Fit, traits: dict[str, Tr
         return
     at = np.concatenate([[0.0], np.cumsum(leaf.segment_lengths)])
     collar = _on(leaf, at, start)
-    seen = whole if result.estimate is None else min(1.0, result.estimate.seen) * whole
+    seen = result.midrib_seen * whole
     for panel in (side, facing):
         panel.line(_part(leaf, at, start, max(seen, start)), MEASURE, 1.8)
         panel.line(_part(leaf, at, max(seen, start), whole), MEASURE, 1.8, style=":")
@@ -224,7 +240,7 @@ def _arc(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(np.cos(angle) * first + np.sin(angle) * beside)
 
 
-def plot_convergence(result: Fit) -> Figure:
+def plot_convergence(result: FittedPhytomer) -> Figure:
     """How the search went: mean and spread of the elite for each parameter, and its errors, over the generations
     (Fig. 6b)."""
     searched = len(result.history[0].mean)
@@ -233,7 +249,8 @@ def plot_convergence(result: Fit) -> Figure:
     scale = np.array([result.scale if unit == "cm" else 1.0 for unit in units])
     mean = np.array([g.mean for g in result.history]) * scale
     std = np.array([np.sqrt(np.diag(g.cov)) for g in result.history]) * scale
-    length = "rel" if result.relative else "cm"
+    length = result.length_unit
+    refined = isinstance(result, Fit)
     n_columns = 4
     n_rows = -(-(len(names) + 1) // n_columns)
     figure = Figure(figsize=(PAGE_IN, 2.2 * n_rows + 0.5), layout="constrained")
@@ -242,7 +259,7 @@ def plot_convergence(result: Fit) -> Figure:
     for i, (ax, name, unit) in enumerate(zip(axes, names, units, strict=False)):
         ax.fill_between(generation, mean[:, i] - std[:, i], mean[:, i] + std[:, i], color=SPREAD, lw=0)
         ax.plot(generation, mean[:, i], color=MEASURE, marker="o", markersize=3)
-        if result.estimate is not None:
+        if refined:
             ax.axhline(result.parameters[name], color=INK, lw=1.2, ls="--")
         ax.set_title(f"{name.replace('_', ' ')} ({length if unit == 'cm' else unit})", fontsize=SMALL)
     errors = axes[len(names)]
@@ -263,7 +280,7 @@ def plot_convergence(result: Fit) -> Figure:
         (Line2D([], [], color=STEM_EDGE), "worst of them"),
         (Line2D([], [], color=LEAF_EDGE, ls=":"), "best"),
     ]
-    if result.estimate is not None:
+    if refined:
         marks.insert(2, (Line2D([], [], color=INK, ls="--"), "the fit"))
     handles, texts = zip(*marks, strict=True)
     figure.legend(handles, texts, loc="outside upper left", ncols=3, frameon=False, fontsize=SMALL)

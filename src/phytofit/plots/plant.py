@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from phytofit.plots.page import (
     CELL_IN,
     GREY,
+    INK,
     LARGE,
     MARGIN_IN,
     NORMAL,
     PAGE_IN,
+    QUALITY,
     SMALL,
     SPACE_IN,
     Legend,
@@ -27,12 +29,13 @@ from phytofit.plots.page import (
     figures,
     fitting,
     folded,
-    in_short,
     interval,
     number,
+    quality_legend,
 )
 from phytofit.plots.views import Arrangement, Panel, View, arranged, widest_side
 from phytofit.reconstruct import Reconstruction
+from phytofit.results.remarks import in_short
 from phytofit.segmentation import Segmentation
 
 __all__ = ["LEAF_COLORS", "plot_plant", "plot_reconstruction", "plot_segmentation"]
@@ -70,7 +73,7 @@ def plot_plant(result: Segmentation | Sequence[Segmentation], table: pd.DataFram
         mine = table[table["plant"] == i] if len(plants) > 1 else table
         name = f"{title}, plant {i}".removeprefix(", ") if len(plants) > 1 else title
         tables = (_plant_table(plant, mine), _leaf_traits(plant, mine))
-        blocks.append(_Block.of(plant, name, "95 % intervals in brackets", tables, ()))
+        blocks.append(_Block.of(plant, name, "95 % intervals in brackets", tables, quality_legend()))
     return _page_of(blocks)
 
 
@@ -90,7 +93,8 @@ def plot_segmentation(result: Segmentation, title: str = "") -> Figure:
         (None, *(_leaf_color(leaf.rank) for leaf in result.leaves)),
     )
     said = f"{len(result.cloud):,} points; stem {number(result.stem_length, 1)} {unit} along its axis"
-    return _page_of([_Block.of(result, title, said, (table,), result.notes)])
+    notes = [Line(text, color=GREY) for note in result.notes for text in folded(f"• {note}", TABLE_IN, 3)]
+    return _page_of([_Block.of(result, title, said, (table,), notes)])
 
 
 @dataclass(frozen=True)
@@ -109,13 +113,12 @@ class _Block:
 
     @classmethod
     def of(
-        cls, plant: Segmentation, title: str, said: str, tables: tuple[Table, ...], notes: Sequence[str]
+        cls, plant: Segmentation, title: str, said: str, tables: tuple[Table, ...], remarks: Sequence[Line]
     ) -> "_Block":
         up, stated = _upright(plant)
         heading = [Line(text, LARGE, bold=True) for text in folded(title, TABLE_IN, 2, LARGE, bold=True)]
         said += "" if stated else "; drawn upright along its stem, as it was not stated which way is up"
         heading += [Line(text, color=GREY) for text in folded(said, TABLE_IN, 3)]
-        remarks = [Line(text, color=GREY) for note in notes for text in folded(f"• {note}", TABLE_IN, 3)]
         near = _near(plant)
         chosen = np.flatnonzero(near)
         chosen = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), MOST_DRAWN)).astype(int)]
@@ -196,7 +199,7 @@ def _leaf_traits(plant: Segmentation, table: pd.DataFrame) -> Table:
     rows = [_head(("leaf", *(f"{said}\n({units.get(name, unit)})" for name, said in MEASURED.items()), "to check"))]
     for leaf in plant.leaves:
         mine = table[(table["rank"] == leaf.rank) & (table["organ"] != "plant")]
-        flags = [flag for text in mine["flags"].dropna() for flag in str(text).split("; ") if flag]
+        flags = [code for text in mine["flags"].dropna() for code in str(text).split(";") if code]
         traits = [_value(mine[mine["trait"] == name]) for name in MEASURED]
         rows.append(((Line(str(leaf.rank), NORMAL, bold=True),), *traits, _remarks(flags, LEAVES_IN[-1])))
     aligns = ("right", "center", "center", "center", "left")
@@ -204,21 +207,23 @@ def _leaf_traits(plant: Segmentation, table: pd.DataFrame) -> Table:
 
 
 def _value(rows: pd.DataFrame, unit: str = "") -> tuple[Line, ...]:
-    """The value of the first of the rows, with its interval below; a dash where there is none."""
+    """The value of the first of the rows, with the mark of its quality, and its interval below; a dash where there is
+    none."""
     if not len(rows):
         return (Line("–", NORMAL, color=GREY),)
     value, low, high = (float(rows[column].iloc[0]) for column in ("value", "low", "high"))
     decimals = digits(value, low, high)
     width = LEAVES_IN[1] - CELL_IN
-    first = figures(f"{number(value, decimals)} {unit}".rstrip(), width, bold=True)
+    mark, color = QUALITY.get(str(rows["quality"].iloc[0]), ("", INK))
+    first = figures(" ".join(filter(None, (number(value, decimals), unit, mark))), width, bold=True, color=color)
     ends = interval(low, high, decimals)
     return (first, figures(f"({ends})", width, SMALL, color=GREY)) if ends else (first,)
 
 
 def _remarks(flags: Sequence[str], width: float) -> tuple[Line, ...]:
-    """What the flags say was seen, in a few lines; that there is no fit comes first."""
-    ordered = sorted(flags, key=lambda flag: not flag.startswith("not fitted"))
-    said = "; ".join(dict.fromkeys(in_short(flag) for flag in ordered))
+    """What the codes say, in a few lines; that there is no fit comes first."""
+    ordered = sorted(dict.fromkeys(flags), key=lambda code: code != "not_fitted")
+    said = "; ".join(map(in_short, ordered))
     return tuple(Line(text) for text in folded(said, width - 0.12, MOST_LINES)) or (Line("–", color=GREY),)
 
 

@@ -25,13 +25,14 @@ img { max-width: 100%; } .note { color: #555; }
 @media print { body { max-width: none; } }
 """
 GENERATOR = '<meta name="generator" content="phytofit">'  # says whose page it is
-HEADINGS = ("n", "bias", "RMSE", "MAE", "R", "CCC", "limits of agreement", "covered", "flagged", "outliers")
+HEADINGS = ("n", "bias", "RMSE", "MAE", "R", "CCC", "limits of agreement", "covered", "good, check, poor", "outliers")
 MEANING = (
     "Differences are result minus {measure}. Bias is their mean, RMSE their root mean square, MAE the mean of their "
     "sizes. R is Pearson's correlation, CCC Lin's concordance correlation, which falls with bias too. The limits of "
     "agreement (Bland and Altman) hold 95 % of the differences if these are normally distributed. Covered: how many "
     "{measure}s lie within the result's 95 % interval. An interval with one end only, drawn with an arrow, holds all "
-    "that is beyond it. Flagged: results with a remark that says what to doubt. Outliers: clouds whose difference is "
+    "that is beyond it. Good, check, poor: how far the results say that they can be trusted; poor ones should not be "
+    "used. Outliers: clouds whose difference is "
     "far from the others' (modified z-score above 3.5)."
 )
 
@@ -48,7 +49,7 @@ def agreement_table(found: Sequence[Agreement]) -> pd.DataFrame:
             _number(a.ccc),
             "" if a.n < 2 else f"{a.lower:.2f} to {a.upper:.2f}",
             f"{round(a.coverage * a.n_intervals)} of {a.n_intervals}" if a.n_intervals else "",
-            f"{a.flagged} of {a.n}",
+            f"{a.good}, {a.check}, {a.poor}",
             ", ".join(a.outliers),
         )
         for a in found

@@ -1,141 +1,387 @@
-"""Remarks on a fit in plain words: where its numbers rest on little, or on nothing."""
+"""Remarks on results: what was noticed, which traits it touches, how far to trust these, and what to do about it.
 
-from collections.abc import Iterator
+`KINDS` is the one table of them; docs/remarks.md is written from it.
+"""
 
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
-from phytofit.engine.sighting import OFFSET, Sighting
-from phytofit.parameters import ParameterSpace
+__all__ = [
+    "CHECK",
+    "GOOD",
+    "KINDS",
+    "NOTE",
+    "POOR",
+    "Kind",
+    "Placed",
+    "Remark",
+    "grouped",
+    "in_short",
+    "of_codes",
+    "remark",
+    "worst",
+]
 
-__all__ = ["FEW_ON_STEM", "IMPLAUSIBLE", "NEAR_BOUND", "UNUSABLE", "flags_of"]
+GOOD, CHECK, POOR = "good", "check", "poor"  # how far to trust a trait
+NOTE = "note"  # the grade of a remark that touches no trait
+ORDER = (POOR, CHECK, GOOD, NOTE)  # the worst first
 
-FloatArray = NDArray[np.float64]
-FEW_FOR_SHAPE = 200.0  # points, fewer than which tell little of a leaf with a shape of its own
-ROUND = 0.7  # share of them that must be seen
-MANY_GAPS = 0.1  # share of the blade
-FEW_ON_STEM = 60  # points
-LITTLE_EXPLAINED = 0.1  # share of outliers that is worth a remark
-MUCH_NOISE_CM = 1.0
-BLURRED = 2.0  # stem noises in a stem's radius, below which a tube can't be told from a filled stem
-EDGE_ON = 1.5  # leaf noises in a leaf's half width, below which the width is not resolved
-UNUSABLE = "unusable: "  # with which a flag begins that says not to use the numbers
-IMPLAUSIBLE = 4.0  # spreads of the prior
-BOUNDED = ("stem_diameter", "leaf_angle", "leaf_length", "leaf_width", "stem_diameter_above")
-NEAR_BOUND = 1e-6
-TIP_DOUBTFUL = "the leaf's tip may be missing: leaf length and area may be larger. Look at the tip in fit.png"
-BEYOND_TIP = "{:.0f} points lie beyond the fitted tip: the leaf may be longer. Look at the tip in fit.png"
-CUT_BACK = (
-    "no points on the last {:.0f} % of the fitted leaf, where {:.0f} are expected: leaf length ends where the points "
-    "do. Check the tip in fit.png"
-)
-BLUNT = "the leaf ends bluntly, as if its tip were cut off: leaf length and area are those of the part that was seen"
-ALONG_STEM = "the leaf hugs its stem: leaf length counts from where it leaves the stem, and may be {:.2g} {} more"
-TIP_NOT_SEEN = "the leaf's tip is missing: leaf length and area may be larger. Scan the tip"
-
-
-def flags_of(
-    space: ParameterSpace,
-    x: FloatArray,
-    seen: Sighting,
-    *,
-    noise: FloatArray,
-    outlier_share: float,
-    midrib_seen: float,
-    tip_seen: bool,
-    blunt: bool,
-    ends_at: float,
-    scale: float = 1.0,
-) -> Iterator[str]:
-    """The remarks on a fit: parameters x (k,), noise (2,) or more on stem and leaf, share of outliers, share of the
-    midrib that was seen, whether its tip clearly was, whether it ends bluntly, share of the midrib at which it does;
-    `scale` input lengths make a cm."""
-    if midrib_seen < 1.0:
-        yield TIP_NOT_SEEN
-    elif blunt:
-        yield BLUNT
-    if ends_at < 1.0:
-        yield CUT_BACK.format(100.0 * (1.0 - ends_at), seen.short)
-    elif midrib_seen == 1.0 and not blunt and not tip_seen:
-        yield TIP_DOUBTFUL
-    if seen.beyond:
-        yield BEYOND_TIP.format(seen.beyond)
-    yield from _of_what_was_seen(seen, OFFSET in space.names)
-    if seen.along_stem:
-        yield ALONG_STEM.format(seen.along_stem * scale, _length_unit(scale))
-    if outlier_share >= LITTLE_EXPLAINED:
-        yield (
-            f"the model does not explain {100 * outlier_share:.0f} % of the points: another leaf or clutter may be in "
-            "the cloud. Look at fit.png and cut the cloud more cleanly"
-        )
-    for name, std in zip(("stem", "leaf"), noise, strict=False):
-        if std > MUCH_NOISE_CM:
-            scatter = f"{std * scale:.3g} {_length_unit(scale)}"
-            yield (
-                f"the points scatter by {scatter} around the {name}, far more than expected: check the unit, and the "
-                "fit in fit.png"
-            )
-    value = dict(zip(space.names, x.tolist(), strict=True))
-    if 0.5 * value["stem_diameter"] < BLURRED * noise[0]:
-        yield (
-            "the stem's points scatter by half its radius or more: stem diameter is too small if the stem's section is "
-            "filled with points"
-        )
-    if 0.5 * value["leaf_width"] < EDGE_ON * noise[1]:
-        yield (
-            "the leaf is hardly wider than its points scatter, as if seen edge-on: leaf width and area are uncertain. "
-            "Scan across the blade"
-        )
-    yield from _against_the_prior(space, x, scale)
+STEM = ("stem_diameter", "stem_length")
+ANGLES = ("leaf_angle", "leaf_insertion_angle")
+WIDTHS = ("leaf_width", "leaf_area")
+LENGTHS = ("leaf_length", "leaf_area")
+LEAF = ("leaf_length", *ANGLES, "leaf_width", "leaf_curvature", "leaf_area")
 
 
-def _of_what_was_seen(seen: Sighting, own_shape: bool) -> Iterator[str]:
-    if not seen.shows_base:
-        yield (
-            "the leaf's base is hidden: leaf angle and insertion angle follow from the rest of the leaf. Scan the base"
-        )
-    if seen.leaf < 0.5:
-        yield (
-            f"only {100 * seen.leaf:.0f} % of the leaf was seen: the rest of its length, width and area comes from the "
-            "model. Scan from more sides"
-        )
-    elif seen.gaps >= MANY_GAPS:
-        yield (
-            f"{100 * seen.gaps:.0f} % of the blade has almost no points: leaf width and area come from the rest and "
-            "may be off. Scan from more sides"
-        )
-    if seen.leaf_points < FEW_FOR_SHAPE and own_shape:
-        yield (
-            f"only {seen.leaf_points:.0f} points on the leaf: leaf length may be off by several cm. Scan more densely"
-        )
-    if seen.stem_points < FEW_ON_STEM:
-        yield (
-            f"only {seen.stem_points:.0f} points on the stem: stem diameter and leaf angle are uncertain. Keep a "
-            "longer piece of stem"
-        )
-    elif seen.sectors < ROUND:
-        yield (
-            f"the stem was seen from one side ({360 * seen.sectors:.0f}° of its circumference): stem diameter may be "
-            "off. Scan from more sides"
-        )
+@dataclass(frozen=True)
+class Remark:
+    """Something that was noticed about a result.
+
+    ``code`` is its name in tables, ``traits`` those that it touches, ``grade`` the best quality ("check" or "poor")
+    that these can have, or "note" where it touches none; ``text`` says what was noticed, ``remedy`` what to do.
+    """
+
+    code: str
+    traits: tuple[str, ...]
+    grade: str
+    text: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.text}. {self.remedy}".removesuffix(". ")
 
 
-def _against_the_prior(space: ParameterSpace, x: FloatArray, scale: float) -> Iterator[str]:
-    for i, p in enumerate(space.parameters):
-        value, unit = (x[i] * scale, _length_unit(scale)) if p.unit == "cm" else (x[i], p.unit)
-        along_stem = p.name == "leaf_angle" and x[i] == p.lower and "leaf_base_bend" in space.names  # as leaves may be
-        at_bound = min(x[i] - p.lower, p.upper - x[i]) < NEAR_BOUND and not along_stem
-        if at_bound and (p.name in BOUNDED or p.unit == "deg"):  # a share may be 0 or 1; no angle is the greatest
-            yield (
-                f"{p.name} is at the limit of the species, {value:.3g} {unit}: check the unit, or widen the limit in a "
-                "species file"
-            )
-        elif p.name in BOUNDED and abs(x[i] - p.mean) > IMPLAUSIBLE * p.std:
-            yield (
-                f"{p.name} of {value:.3g} {unit} is unusual for the species: check the unit, and in fit.png whether "
-                "this is one leaf on its stem"
-            )
+class Placed(NamedTuple):
+    """A remark on one leaf: the number of its plant and its rank, 0 where there is but one."""
+
+    remark: Remark
+    plant: int = 0
+    rank: int = 0
 
 
-def _length_unit(scale: float) -> str:
-    return "cm" if scale == 1.0 else "(relative length)"
+@dataclass(frozen=True)
+class Kind:
+    """What all remarks of one code share: the traits that they touch, unless a remark names its own; the grade; the
+    text, with {places} for what differs; what to do; when such a remark is made; and the text without what differs, by
+    which several are said at once."""
+
+    traits: tuple[str, ...]
+    grade: str
+    text: str
+    remedy: str
+    when: str
+    general: str = ""
+
+
+KINDS = {
+    # the leaf's tip
+    "tip_unseen": Kind(
+        LENGTHS,
+        CHECK,
+        "the leaf's tip is missing: the leaf may be longer",
+        "Scan the tip",
+        "The leaf stops while it is still wide, and a leaf that goes on explains the points clearly better. The "
+        "intervals of length and area have no upper end.",
+    ),
+    "tip_doubtful": Kind(
+        LENGTHS,
+        CHECK,
+        "the leaf's tip may be missing: the leaf may be longer",
+        "Look at the tip in fit.png",
+        "A leaf that goes on explains the points better, but not clearly; or points lie beyond the fitted tip. The "
+        "intervals of length and area have no upper end.",
+    ),
+    "tip_blunt": Kind(
+        LENGTHS,
+        CHECK,
+        "the leaf ends bluntly, as if its tip were cut off: length and area are those of the part that was seen",
+        "Look at the tip in fit.png",
+        "The leaf stops while it is still wide, but its shape says little about what is missing.",
+    ),
+    "tip_cut_back": Kind(
+        LENGTHS,
+        CHECK,
+        "no points on the last {share} of the fitted leaf, where {n} are expected: the leaf ends where the points do",
+        "Look at the tip in fit.png",
+        "The model's leaf goes on where there is no point. The trait `leaf_length` is cut back, the parameter of that "
+        "name in `fit.json` is not.",
+        "no points on the last part of the fitted leaf: the leaf ends where the points do",
+    ),
+    "tip_exceeded": Kind(
+        LENGTHS,
+        CHECK,
+        "{n} points lie beyond the fitted tip: the leaf may be longer",
+        "Look at the tip in fit.png",
+        "Clearly more points than stray ones lie beyond the tip: it bends away sharply, or something touches it.",
+        "points lie beyond the fitted tip: the leaf may be longer",
+    ),
+    # the leaf
+    "leaf_mostly_unseen": Kind(
+        LEAF,
+        CHECK,
+        "only {share} of the leaf was seen: the rest comes from the model",
+        "Scan from more sides",
+        "Less than half of the leaf's area has points.",
+        "less than half of the leaf was seen: the rest comes from the model",
+    ),
+    "width_holes": Kind(
+        WIDTHS,
+        CHECK,
+        "{share} of the blade has almost no points: leaf width and area come from the rest",
+        "Scan from more sides",
+        "A tenth of the blade or more has no points, where other parts have many.",
+        "parts of the blade have almost no points: leaf width and area come from the rest",
+    ),
+    "leaf_edge_on": Kind(
+        WIDTHS,
+        CHECK,
+        "the leaf is hardly wider than its points scatter, as if seen edge-on",
+        "Scan across the blade",
+        "Half the leaf's width is less than one and a half times the noise.",
+    ),
+    "leaf_few_points": Kind(
+        LEAF,
+        CHECK,
+        "only {n} points on the leaf: its length tends to come out too short",
+        "Scan more densely",
+        "Fewer than 200 points on a leaf that is bent or shaped in its own way.",
+        "few points on the leaf: its length tends to come out too short",
+    ),
+    "base_hidden": Kind(
+        ANGLES,
+        CHECK,
+        "the leaf's base is hidden: its angles follow from the rest of the leaf",
+        "Scan the base",
+        "The leaf's first tenth has hardly any points, or neither stem nor leaf was seen where it starts.",
+    ),
+    "hugs_stem": Kind(
+        ("leaf_length",),
+        CHECK,
+        "the leaf hugs its stem: its length counts from where it leaves the stem, and may be {length} more",
+        "Look at the leaf's base in fit.png",
+        "The midrib starts so near the stem's surface that it may be just inside or just outside.",
+        "the leaf hugs its stem: its length counts from where it leaves the stem, and may be more",
+    ),
+    # the stem
+    "stem_few_points": Kind(
+        ("stem_diameter", "leaf_angle"),
+        CHECK,
+        "only {n} points on the stem",
+        "Keep a longer piece of stem",
+        "Fewer than 60 points are on the stem.",
+        "few points on the stem",
+    ),
+    "stem_one_sided": Kind(
+        ("stem_diameter",),
+        CHECK,
+        "the stem was seen from one side ({angle} of its circumference)",
+        "Scan from more sides",
+        "Less than seven tenths of the stem's circumference has points.",
+        "the stem was seen from one side",
+    ),
+    "stem_filled": Kind(
+        ("stem_diameter",),
+        CHECK,
+        "the stem's points scatter by half its radius or more: if its section is filled with points, it is thicker",
+        "Look at the stem in fit.png",
+        "In so much noise a hollow tube and a filled stem look alike. A filled one comes out too thin.",
+    ),
+    "stem_ends_elsewhere": Kind(
+        ("stem_length", *ANGLES),
+        CHECK,
+        "the stem goes on {above} above the leaf and {below} below it: stem_above={better!r} may fit better than "
+        "{how!r}",
+        "Fit again with it",
+        "The stem was stated to end at the leaf, or to be as long above it as below (`--stem-above`); this cloud's is "
+        "not.",
+    ),
+    # the whole
+    "two_fits": Kind(
+        (),
+        POOR,
+        "two fits are about equally probable: {others}",
+        "Look at fit.png",
+        "Two models explain the points about equally well, and the second one's values lie beyond the intervals. "
+        "Touches the traits that it names.",
+        "two fits are about equally probable",
+    ),
+    "not_converged": Kind(
+        (*STEM, *LEAF),
+        CHECK,
+        "the fit did not converge",
+        "Look at fit.png, or try another seed",
+        "The refinement stopped before it came to rest.",
+    ),
+    "search_split": Kind(
+        (*STEM, *LEAF),
+        CHECK,
+        "the search did not converge: its last best candidates differ",
+        "Use more generations or samples, or another seed",
+        "With `--method paper`: what lies between the best candidates fits worse than they do.",
+    ),
+    "points_unexplained": Kind(
+        (*STEM, *LEAF),
+        CHECK,
+        "the model does not explain {share} of the points: another leaf or clutter may be in the cloud",
+        "Look at fit.png and cut the cloud more cleanly",
+        "A tenth of the points or more are outliers.",
+        "the model does not explain many of the points: another leaf or clutter may be in the cloud",
+    ),
+    "other_surfaces": Kind(
+        (*STEM, *LEAF),
+        POOR,
+        "{share} of the points lie on surfaces that are neither the fitted stem nor the fitted leaf",
+        "Cut the other leaves away",
+        "With `--seed-point`: other leaves remain in the cloud.",
+    ),
+    "others_touch": Kind(
+        ("leaf_angle", *WIDTHS, "stem_diameter"),
+        CHECK,
+        "other leaves touch this one or its stem",
+        "Cut them away",
+        "With `--seed-point`: what was left out comes within 2 cm of the leaf, or within 3 cm of the stem near where "
+        "the leaf leaves it.",
+    ),
+    "much_noise": Kind(
+        (),
+        CHECK,
+        "the points scatter by {scatter} around the {organ}, far more than expected",
+        "Check the unit, and the fit in fit.png",
+        "More than 1 cm of noise on the stem or the leaf. Touches the traits of that organ.",
+        "the points scatter far more than expected",
+    ),
+    "at_limit": Kind(
+        (),
+        CHECK,
+        "{parameter} is at the limit of the species, {value}",
+        "Check the unit, or widen the limit in a species file",
+        "The species' bound stopped the search. Touches the traits that follow from the parameter. At a limit of the "
+        "leaf's own shape (twist, roll, bend), points of something else may be in the fit.",
+        "a parameter is at the limit of the species",
+    ),
+    "unusual": Kind(
+        (),
+        CHECK,
+        "{parameter} of {value} is unusual for the species",
+        "Check the unit, and in fit.png whether this is one leaf on its stem",
+        "A parameter lies more than four standard deviations from the species' mean. Touches the traits that follow "
+        "from it.",
+        "a parameter is unusual for the species",
+    ),
+    "up_unknown": Kind(
+        ANGLES,
+        CHECK,
+        "this leaf does not show which way is up: its angles may be 180° minus these values",
+        "State up if it is known",
+        "The leaf's shape is plausible either way up.",
+    ),
+    "up_doubtful": Kind(
+        ANGLES,
+        CHECK,
+        "with the stated up, the leaf points down or bends upwards",
+        "Check which way is up",
+        "With the `--up` that was given, the leaf is much less plausible than upside down. If it is right, the leaf is "
+        "unusual.",
+    ),
+    # the intervals
+    "interval_wide": Kind(
+        (),
+        CHECK,
+        "wide intervals: {named}",
+        "Use them with their intervals",
+        "The cloud says little about these traits. Their intervals are wide, which is not to say wrong.",
+        "some intervals are wide",
+    ),
+    "interval_useless": Kind(
+        (),
+        POOR,
+        "intervals too wide to be of use: {named}",
+        "Scan more densely, or from more sides",
+        "The cloud says next to nothing about these traits.",
+        "some intervals are too wide to be of use",
+    ),
+    # of whole plants
+    "not_fitted": Kind(
+        ("leaf_length",),
+        CHECK,
+        "not fitted: {reason}",
+        "Look at its points in segmentation.png",
+        "The leaf could not be fitted. Its length is read along its points, without an interval.",
+    ),
+    "rank_uncertain": Kind(
+        ("collar_height", "collar_distance", "divergence_angle"),
+        CHECK,
+        "the collar is next to another leaf's: their ranks may be swapped",
+        "Look at plant.png",
+        "Two leaves leave the stem at nearly the same height.",
+    ),
+    "leaf_doubtful": Kind(
+        (*LEAF, "collar_height", "collar_distance", "divergence_angle", "leaf_azimuth"),
+        CHECK,
+        "few points: this may not be a leaf",
+        "Look at plant.png",
+        "It has fewer points than a leaf usually has.",
+    ),
+    "views": Kind(
+        (),
+        NOTE,
+        "{said}",
+        "",
+        "The views of a reconstruction do not fit each other, or do not show all of the plant. The text says what to "
+        "do.",
+    ),
+}
+
+
+def remark(code: str, *, traits: Sequence[str] | None = None, **values: object) -> Remark:
+    """A remark of a kind, with its `values` in the text; on these `traits` where not on those of its kind."""
+    kind = KINDS[code]
+    return Remark(code, kind.traits if traits is None else tuple(traits), kind.grade, kind.text.format(**values),
+                  kind.remedy)  # fmt: skip
+
+
+def of_codes(codes: Iterable[str]) -> tuple[Remark, ...]:
+    """The remarks that some codes stand for; none for what another version called by another code."""
+    return tuple(remark(code) for code in codes if code in KINDS)
+
+
+def in_short(code: str) -> str:
+    """A code as a few words."""
+    return code.replace("_", " ")
+
+
+def worst(grades: Iterable[str]) -> str:
+    """The worst of some qualities; empty of none."""
+    return min(grades, key=ORDER.index, default="")
+
+
+def grouped(placed: Iterable[Placed]) -> list[tuple[str, str]]:
+    """Grade and line of each remark, the worst first, said once for all the leaves to which it applies."""
+    found: dict[tuple[str, str], dict[str, list[tuple[int, int]]]] = {}
+    for one, *place in placed:
+        found.setdefault((one.grade, one.code), {}).setdefault(str(one), []).append((place[0], place[1]))
+    lines = []
+    for (grade, code), said in sorted(found.items(), key=lambda item: ORDER.index(item[0][0])):
+        kind = KINDS.get(code)
+        if len(said) > 1 and kind is not None and kind.general:
+            places = [place for each in said.values() for place in each]
+            lines.append((grade, f"{_named(places)}{Remark(code, (), grade, kind.general, kind.remedy)} ({code})"))
+        else:
+            lines += [(grade, f"{_named(places)}{text} ({code})") for text, places in said.items()]
+    return lines
+
+
+def _named(places: Iterable[tuple[int, int]]) -> str:
+    """Of which plants and leaves a line is, with a colon; nothing where there is but one."""
+    ranks: dict[int, list[int]] = {}
+    for plant, rank in dict.fromkeys(places):
+        ranks.setdefault(plant, []).append(rank)
+    named = []
+    for plant, leaves in ranks.items():
+        parts = [f"plant {plant}"] if plant else []
+        numbers = [str(rank) for rank in leaves if rank]
+        parts += [f"{'leaf' if len(numbers) == 1 else 'leaves'} {', '.join(numbers)}"] if numbers else []
+        named.append(" ".join(parts))
+    whole = "; ".join(filter(None, named))
+    return f"{whole}: " if whole else ""

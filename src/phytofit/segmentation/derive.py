@@ -25,7 +25,7 @@ class SegmentedLeaf:
     direction in which it leaves the stem, deg, counter-clockwise seen from above from the x axis (from y, where x is
     upright); ``collar`` (3,) the place on the stem's axis, cm, ``collar_distance`` how far it is along the stem from
     its base and ``collar_height`` how high above it, cm; ``tip`` (3,); ``midrib`` (k, 3) from the collar to the tip,
-    ``length`` along it from the stem's surface, cm; ``n_points`` of the cloud.  ``flags`` are remarks in plain words.
+    ``length`` along it from the stem's surface, cm; ``n_points`` of the cloud.  ``flags`` are codes of remarks.
     """
 
     rank: int
@@ -63,7 +63,7 @@ def derive_leaves(
         beside = [other for other, _ in found[max(rank - 2, 0) : rank + 1] if other is not leaf]
         flags = list(leaf.flags)
         if any(abs(o.collar_distance - leaf.collar_distance) < CLOSE_COLLARS * organs.radius for o in beside):
-            flags.append("collar next to another leaf's: their ranks may be swapped")
+            flags.append("rank_uncertain")
         leaves.append(SegmentedLeaf(**{**leaf.__dict__, "rank": rank, "flags": tuple(flags)}))
     return leaves, [label for _, label in found]
 
@@ -91,7 +91,7 @@ def _leaf(
     zero, ninety = azimuth_frame(up)
     side = midrib[: max(3, len(midrib) // 2)].mean(axis=0) - collar
     azimuth = float(np.degrees(np.arctan2(side @ ninety, side @ zero)) % 360.0)
-    flags = ["few points: this may not be a leaf"] if len(nodes) < FEW_NODES else []
+    flags = ["leaf_doubtful"] if len(nodes) < FEW_NODES else []
     return SegmentedLeaf(
         rank=0,
         azimuth=azimuth,

@@ -22,9 +22,6 @@ N_PROBED = 300  # points around which it is seen whether there is any noise
 N_LOOKED_AT = 100_000  # points, if they are all kept for the fit, in which the stem is looked for
 CANONICAL_DECIMALS = 6  # cm; hides the rounding of a rotated copy's coordinates
 STUB = 0.1  # of the points of the largest labelled leaf, up to which another is but a stub
-OTHERS_TOUCH = (
-    "other leaves touch this one or its stem: leaf angle, leaf width and stem diameter may be off. Cut them away"
-)
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ class Prepared:
     its points that are left when it is thinned, ``points`` (m, 3) those as seen from the best start pose, upright, in
     the prior's cm, ``organ`` (m,) what their labels say (0 stem, 1 leaf, -1 unknown) or None; ``starts`` the start
     poses in that frame; ``home`` (4, 4) maps it to the cloud's, ``scale`` of whose lengths make a cm.  ``notes`` tell
-    what was left out, ``flags`` what that may have done to the rest.
+    what was left out, ``others_touch`` whether that came near the rest.
     """
 
     used: PointCloud
@@ -46,7 +43,7 @@ class Prepared:
     home: FloatArray
     scale: float
     notes: tuple[str, ...] = ()
-    flags: tuple[str, ...] = ()
+    others_touch: bool = False
 
 
 def prepare(
@@ -78,8 +75,7 @@ def prepare(
         target = cloud.take(np.flatnonzero(on_target))
         found = prepare(target, species, n_points=n_points, up=up, with_outliers=with_outliers)
         left_out = f"{len(cloud) - len(target)} of {len(cloud)} points left out: not on the seed point's leaf"
-        flags = (OTHERS_TOUCH, *found.flags) if others_touch else found.flags
-        return replace(found, notes=(left_out, *found.notes), flags=flags)
+        return replace(found, notes=(left_out, *found.notes), others_touch=others_touch)
     if cloud.labels is not None:
         _check_one_leaf(cloud.labels)
     starts = find_starts(clean.points / scale)

@@ -18,8 +18,9 @@ class Agreement(NamedTuple):
 
     ``bias`` their mean, ``rmse``, ``mae``; ``r`` Pearson's correlation and ``ccc`` Lin's concordance (NaN with fewer
     than three pairs); ``lower``, ``upper``: Bland and Altman's 95 % limits of agreement; ``coverage``: share of the
-    measures within the results' intervals, of the ``n_intervals`` that there are; ``flagged`` results; ``outliers``:
-    clouds whose difference is far from all the others'.
+    measures within the results' intervals, of the ``n_intervals`` that there are; how many results are ``good``,
+    ``check`` and ``poor`` (of older tables that is not known); ``outliers``: clouds whose difference is far from all
+    the others'.
     """
 
     trait: str
@@ -34,7 +35,9 @@ class Agreement(NamedTuple):
     upper: float
     coverage: float
     n_intervals: int
-    flagged: int
+    good: int
+    check: int
+    poor: int
     outliers: tuple[str, ...]
 
 
@@ -64,7 +67,9 @@ def _agreement(trait: object, group: pd.DataFrame) -> Agreement:
         upper=bias + LIMITS * spread,
         coverage=float(held[given].mean()) if given.any() else np.nan,
         n_intervals=int(given.sum()),
-        flagged=int(group["flags"].fillna("").astype(bool).sum()),
+        good=int((group["quality"] == "good").sum()),
+        check=int((group["quality"] == "check").sum()),
+        poor=int((group["quality"] == "poor").sum()),
         outliers=tuple(group["cloud"].to_numpy()[_far_off(difference)]),
     )
 

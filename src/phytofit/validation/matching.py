@@ -16,7 +16,7 @@ from phytofit.text import for_file_name, for_table
 
 __all__ = ["PAIR_COLUMNS", "Comparison", "compare"]
 
-PAIR_COLUMNS = ["cloud", "trait", "unit", "measured", "value", "low", "high", "flags", "n_measured"]
+PAIR_COLUMNS = ["cloud", "trait", "unit", "measured", "value", "low", "high", "quality", "flags", "n_measured"]
 SEVERAL = {  # what tells results of a trait apart, and what measures need then
     "plant": "of {} plants; expected a column plant in the measures, that counts the plants of a cloud",
     "rank": "of {} leaves; expected a column rank in the measures, that counts leaves from the base",
@@ -29,8 +29,8 @@ Row: TypeAlias = dict[Hashable, Any]
 @dataclass(frozen=True)
 class Comparison:
     """``pairs``: one row for each cloud and trait that both have (cloud, trait, unit, measured, value, low, high,
-    flags, n_measured); ``unmatched``: what has no partner, in words; ``notes``: what was measured repeatedly, and
-    averaged."""
+    quality, flags, n_measured); ``unmatched``: what has no partner, in words; ``notes``: what was measured repeatedly,
+    and averaged."""
 
     pairs: pd.DataFrame
     unmatched: tuple[str, ...]
@@ -38,7 +38,8 @@ class Comparison:
 
 
 def compare(measures: pd.DataFrame, results: pd.DataFrame) -> Comparison:
-    """Pairs of hand measures (as `read_measures` gives them) and results (a table with the columns of ``traits.csv``).
+    """Pairs of hand measures (as `read_measures` gives them) and results (a table with the columns of ``traits.csv``,
+    of which ``quality`` may be missing).
 
     A cloud is found by its name; else by its name without folder, file ending and case, by it without marks between
     words, or without leading zeros, where only one is like that.  Where measures have a ``rank``, of the leaf, or a
@@ -68,9 +69,10 @@ def compare(measures: pd.DataFrame, results: pd.DataFrame) -> Comparison:
             label = _label(cloud, row if of_a_leaf else {**row, "rank": ""})
             found.setdefault((label, trait), (its, []))[1].append(row["value"])
     lone += [f"result, not measured: {cloud}" for cloud in results["cloud"].unique() if cloud not in named.values()]
+    ends = ("value", "low", "high", "quality", "flags")
     pairs = [
-        (label, trait, r["unit"], np.mean(values), r["value"], r["low"], r["high"], r["flags"], len(values))
-        for (label, trait), (r, values) in found.items()
+        (label, trait, its["unit"], np.mean(values), *(its.get(name, "") for name in ends), len(values))
+        for (label, trait), (its, values) in found.items()
     ]
     table = pd.DataFrame(pairs, columns=PAIR_COLUMNS)
     table = table.astype({**dict.fromkeys(PAIR_COLUMNS[3:7], float), "n_measured": int})

@@ -30,7 +30,7 @@ from phytofit.validation.tables import Table, listed, read_table
 __all__ = ["read_measures", "read_results"]
 
 MEASURE_COLUMNS = ["cloud", "plant", "rank", "trait", "value", "unit"]
-RESULT_COLUMNS = ("cloud", "trait", "value", "unit", "low", "high", "flags")
+RESULT_COLUMNS = ("cloud", "trait", "value", "unit", "low", "high", "flags")  # and quality, in newer ones
 RESULT_FILES = ("traits.csv", "traits.xlsx")
 NUMBERS = ("value", "low", "high")
 NO_UNIT = (1.0, "")
@@ -94,7 +94,7 @@ def read_results(path: str | Path) -> pd.DataFrame:
     """The table of a folder of results, ``traits.csv`` or ``traits.xlsx`` in it, or that file, also if a spreadsheet
     saved it again.
 
-    Columns are found by their names; ``plant`` and ``rank`` are empty where they are missing.
+    Columns are found by their names; ``plant``, ``rank`` and ``quality`` are empty where they are missing.
 
     Raises
     ------
@@ -113,6 +113,8 @@ def read_results(path: str | Path) -> pd.DataFrame:
     made = pd.DataFrame({name: [text_of(row[i]) for row in table.rows] for name, i in column.items()})
     numbers = _values(table, {(row, column[name]): NO_UNIT for name in NUMBERS for row in range(len(table.rows))})
     made[list(NUMBERS)] = np.reshape(numbers, (len(NUMBERS), -1)).T
+    if "quality" not in made:
+        made["quality"] = ""  # a table of an earlier version
     for name in ("plant", "rank"):
         cells = [row[column[name]] for row in table.rows] if name in column else [""] * len(table.rows)
         made[name] = [_count(cell) or text_of(cell) for cell in cells]

@@ -61,8 +61,8 @@ def trial(
             refused.append(f"{name}: {error}")
             continue
         for truth, found in zip(measure(made.organs), result.traits, strict=True):
-            flags = "; ".join(found.flags)
-            pairs.append((name, found.name, found.unit, truth.value, found.value, found.low, found.high, flags, 1))
+            said = found.quality, ";".join(found.flags)
+            pairs.append((name, found.name, found.unit, truth.value, found.value, found.low, found.high, *said, 1))
     table = pd.DataFrame(pairs, columns=PAIR_COLUMNS).astype(
         {**dict.fromkeys(PAIR_COLUMNS[3:7], float), "n_measured": int}
     )
@@ -118,7 +118,7 @@ def needed(trials: Mapping[int, Trial], percent: float, degrees: float) -> dict[
 
 
 def trial_table(setting: str, trials: Mapping[int, Trial], percent: float, degrees: float) -> pd.DataFrame:
-    """One row for each value of the setting and main trait: errors, share within, coverage, flagged, refused."""
+    """One row for each value of the setting and main trait: errors, share within, coverage, good, refused."""
     rows = []
     for value, made in sorted(trials.items()):
         share = share_within(made, percent, degrees)
@@ -130,6 +130,6 @@ def trial_table(setting: str, trials: Mapping[int, Trial], percent: float, degre
                 continue
             a = found[trait]
             errors = (a.bias, a.rmse, share[trait], a.coverage)
-            rows.append((setting, value, trait, unit, a.n, *errors, a.flagged, made.n - a.n))
-    columns = ["setting", "value", "trait", "unit", "n", "bias", "rmse", "within", "coverage", "flagged", "refused"]
+            rows.append((setting, value, trait, unit, a.n, *errors, a.good, made.n - a.n))
+    columns = ["setting", "value", "trait", "unit", "n", "bias", "rmse", "within", "coverage", "good", "refused"]
     return pd.DataFrame(rows, columns=columns)

@@ -1,0 +1,60 @@
+"""Writes docs/remarks.md from the table of remarks: python docs/remarks.py"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from phytofit.results.quality import LIMITS
+from phytofit.results.remarks import KINDS, NOTE, Kind, in_short
+
+PAGE = Path(__file__).with_name("remarks.md")
+INTRODUCTION = """# Quality and remarks
+
+Each trait has a *quality*, in the table's column `quality`, on the screen, on `fit.png` and on `plant.png`:
+
+| quality | mark | what to do |
+|---|---|---|
+| `good` | ● | use it |
+| `check` | ▲ | look at the picture; use it with its interval |
+| `poor` | ✖ | do not use it |
+| empty | | nothing is known: there is no interval, as with `--method paper`, or from the segmentation |
+
+A trait's quality is the worst that its interval and the remarks that touch it allow. The column `flags` has the codes
+of these remarks, with `;` between them. To keep what is good in R or pandas, filter by `quality`.
+The screen, `fit.json` and the pictures say each remark in full, with what to do.
+
+A good trait can still be wrong: look at the picture.
+
+## Intervals
+
+Half of an interval that is wider than this makes a trait `check` or `poor`. Where one end is open, the closed one
+counts.
+
+| unit | `check` | `poor` |
+|---|---|---|
+"""
+UNITS = {"cm": "lengths (cm)", "cm²": "areas (cm²)", "deg": "angles", "deg/cm": "curvature"}
+
+
+def page() -> str:
+    """All of docs/remarks.md."""
+    limits = "".join(f"| {UNITS[unit]} | {_limit(unit, a)} | {_limit(unit, b)} |\n" for unit, (a, b) in LIMITS.items())
+    return INTRODUCTION + limits + "".join(line for code, kind in KINDS.items() for line in _section(code, kind))
+
+
+def _limit(unit: str, value: float) -> str:
+    return f"{100.0 * value:g} % of the value" if unit in ("cm", "cm²") else f"{value:g} {unit}"
+
+
+def _section(code: str, kind: Kind) -> Iterator[str]:
+    text = re.sub(r"\{[^}]*\}", "…", kind.text)
+    yield f"\n## {code}\n\n*{text}.*\n\n{kind.when}\n\n"
+    if kind.grade != NOTE:
+        touched = ", ".join(map(in_short, kind.traits)) or "the traits that it names"
+        yield f"- Makes `{kind.grade}`: {touched}\n"
+    if kind.remedy:
+        yield f"- What to do: {kind.remedy[:1].lower()}{kind.remedy[1:]}.\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
