@@ -152,7 +152,7 @@ class FittedPhytomer(Shown):
     def _scaled_organs(self, x: FloatArray) -> tuple[Organ, Organ]:
         """Stem and leaf as the model has them, in the model's frame."""
         own = (o.row(0) for o in self.species.model.organs(x))
-        stem, leaf = (Organ(o.kind, o.axis * self.scale, o.frame, o.half_width * self.scale) for o in own)
+        stem, leaf = (replace(o, axis=o.axis * self.scale, half_width=o.half_width * self.scale) for o in own)
         return stem, leaf
 
     @property
