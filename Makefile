@@ -36,6 +36,7 @@ bench: install
 bench-accuracy: install
 	$(BIN)/python benchmarks/trust.py
 	$(BIN)/python benchmarks/foreign.py
+	$(BIN)/python benchmarks/quality.py
 	$(BIN)/python benchmarks/robustness.py
 	$(BIN)/python benchmarks/evidence.py
 	$(BIN)/python benchmarks/leaf_ends.py

@@ -33,10 +33,9 @@ from robustness import SPECIES, SWEEPS
 
 import phytofit
 from phytofit.results.quality import graded, of_intervals
-from phytofit.results.remarks import KINDS, Remark
+from phytofit.results.remarks import KINDS, OF_INTERVALS, Remark
 
 FIRST_SEED = 2_000_000  # not those of other benchmarks
-OF_INTERVALS = ("interval_wide", "interval_useless")
 GRADES = ("good", "check", "poor")
 CLEAN = ("0003", "0006", "0007")  # greenhouse clouds without holes
 

@@ -216,4 +216,4 @@ def _with_interval(traits: "pd.DataFrame", name: str) -> str:
     value, low, high = (traits[column].to_dict()[name] for column in ("value", "low", "high"))
     ends = ["" if math.isnan(end) else f"{end:.1f}" for end in (low, high)]
     mark = MARKS.get(traits["quality"].to_dict()[name], "")
-    return f"{value:.1f}" + (f" ({ends[0]}–{ends[1]})" if any(ends) else "") + f" {mark}".rstrip()
+    return f"{value:.1f}{mark}" + (f" ({ends[0]}–{ends[1]})" if any(ends) else "")

@@ -42,7 +42,7 @@ __all__ = [
     "number",
     "quality_legend",
     "width_in",
-]  # fmt: skip
+]
 
 PAGE_IN = 10.0  # width: where a page is shown 800 pixels wide, a point of type is 1.1 pixels
 MARGIN_IN = 0.2

@@ -35,7 +35,7 @@ from phytofit.plots.page import (
 )
 from phytofit.plots.views import Arrangement, Panel, View, arranged, widest_side
 from phytofit.reconstruct import Reconstruction
-from phytofit.results.remarks import in_short
+from phytofit.results.remarks import OF_INTERVALS, in_short
 from phytofit.segmentation import Segmentation
 
 __all__ = ["LEAF_COLORS", "plot_plant", "plot_reconstruction", "plot_segmentation"]
@@ -221,9 +221,10 @@ def _value(rows: pd.DataFrame, unit: str = "") -> tuple[Line, ...]:
 
 
 def _remarks(flags: Sequence[str], width: float) -> tuple[Line, ...]:
-    """What the codes say, in a few lines; that there is no fit comes first."""
-    ordered = sorted(dict.fromkeys(flags), key=lambda code: code != "not_fitted")
-    said = "; ".join(map(in_short, ordered))
+    """What the codes say, in a few lines, but for those on intervals, which are shown; that there is no fit comes
+    first."""
+    codes = [code for code in dict.fromkeys(flags) if code not in OF_INTERVALS]
+    said = "; ".join(map(in_short, sorted(codes, key=lambda code: code != "not_fitted")))
     return tuple(Line(text) for text in folded(said, width - 0.12, MOST_LINES)) or (Line("–", color=GREY),)
 
 

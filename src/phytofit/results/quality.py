@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from phytofit.results.remarks import CHECK, GOOD, POOR, Remark, in_short, remark, worst
+from phytofit.results.remarks import CHECK, GOOD, OF_INTERVALS, POOR, Remark, in_short, remark, worst
 from phytofit.traits import Trait
 
 __all__ = ["LIMITS", "graded", "half_width", "of_intervals"]
@@ -31,7 +31,7 @@ def half_width(trait: Trait) -> float | None:
 
 def of_intervals(traits: Sequence[Trait]) -> Iterator[Remark]:
     """Remarks on the traits whose intervals are wide, or too wide to be of use."""
-    for code, grade in (("interval_wide", CHECK), ("interval_useless", POOR)):
+    for code, grade in zip(OF_INTERVALS, (CHECK, POOR), strict=True):
         names = [trait.name for trait in traits if _by_width(trait) == grade]
         if names:
             yield remark(code, traits=names, named=", ".join(map(in_short, names)))

@@ -12,6 +12,7 @@ __all__ = [
     "GOOD",
     "KINDS",
     "NOTE",
+    "OF_INTERVALS",
     "POOR",
     "Kind",
     "Placed",
@@ -25,6 +26,7 @@ __all__ = [
 
 GOOD, CHECK, POOR = "good", "check", "poor"  # how far to trust a trait
 NOTE = "note"  # the grade of a remark that touches no trait
+OF_INTERVALS = ("interval_wide", "interval_useless")
 ORDER = (POOR, CHECK, GOOD, NOTE)  # the worst first
 
 STEM = ("stem_diameter", "stem_length")
@@ -291,7 +293,7 @@ KINDS = {
         "wide intervals: {named}",
         "Use them with their intervals",
         "The cloud says little about these traits. Their intervals are wide, which is not to say wrong.",
-        "some intervals are wide",
+        "some intervals are wide: see the column quality of the tables",
     ),
     "interval_useless": Kind(
         (),
@@ -299,7 +301,7 @@ KINDS = {
         "intervals too wide to be of use: {named}",
         "Scan more densely, or from more sides",
         "The cloud says next to nothing about these traits.",
-        "some intervals are too wide to be of use",
+        "some intervals are too wide to be of use: see the column quality of the tables",
     ),
     # of whole plants
     "not_fitted": Kind(
@@ -380,7 +382,7 @@ def _named(places: Iterable[tuple[int, int]]) -> str:
     named = []
     for plant, leaves in ranks.items():
         parts = [f"plant {plant}"] if plant else []
-        numbers = [str(rank) for rank in leaves if rank]
+        numbers = [str(rank) for rank in sorted(leaves) if rank]
         parts += [f"{'leaf' if len(numbers) == 1 else 'leaves'} {', '.join(numbers)}"] if numbers else []
         named.append(" ".join(parts))
     whole = "; ".join(filter(None, named))
