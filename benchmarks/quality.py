@@ -95,15 +95,16 @@ def real(path: Path) -> list[Row]:
     return rows_of(path.parent.name, path.stem, read(path), true)
 
 
-def graded_again(rows: pd.DataFrame) -> Iterator[str]:
-    """The quality of each trait by the limits and the grades as they are now."""
+def graded_again(rows: pd.DataFrame) -> Iterator[tuple[str, str]]:
+    """Quality and codes of each trait by the limits and the grades as they are now."""
     for _, mine in rows.groupby(["part", "cloud"], sort=False):
         for row in mine.itertuples():
             low, high = (None if np.isnan(end) else end for end in (row.low, row.high))
             trait = phytofit.Trait("", 0, row.trait, row.value, row.unit, low, high)
             codes = [code for code in row.flags.split(";") if code and code not in OF_INTERVALS]
             touching = [Remark(code, (row.trait,), KINDS[code].grade, "") for code in codes]
-            yield graded([trait], [*touching, *of_intervals([trait])])[0].quality
+            (again,) = graded([trait], [*touching, *of_intervals([trait])])
+            yield again.quality, ";".join(again.flags)
 
 
 def print_table(rows: pd.DataFrame) -> None:
@@ -154,7 +155,8 @@ def main() -> None:
     given = parser.parse_args()
     if given.kept is not None:
         rows = pd.read_csv(given.kept, dtype={"cloud": str}).fillna({"flags": "", "quality": ""})
-        report(rows.assign(quality=list(graded_again(rows))))
+        quality, flags = zip(*graded_again(rows), strict=True)
+        report(rows.assign(quality=quality, flags=flags))
         return
     found: list[Row] = []
 

@@ -30,20 +30,22 @@ A good trait can still be wrong: look at the picture.
 Half of an interval that is wider than this makes a trait `check` or `poor`. Where one end is open, the closed one
 counts.
 
-| unit | `check` | `poor` |
+| trait | `check` | `poor` |
 |---|---|---|
 """
-UNITS = {"cm": "lengths (cm)", "cm²": "areas (cm²)", "deg": "angles", "deg/cm": "curvature"}
+UNITS = {"leaf_angle": "deg", "leaf_insertion_angle": "deg", "leaf_curvature": "deg/cm"}  # of the others, the value
 
 
 def page() -> str:
     """All of docs/remarks.md."""
-    limits = "".join(f"| {UNITS[unit]} | {_limit(unit, a)} | {_limit(unit, b)} |\n" for unit, (a, b) in LIMITS.items())
+    limits = "".join(
+        f"| {in_short(name)} | {' | '.join(_limit(name, x) for x in ends)} |\n" for name, ends in LIMITS.items()
+    )
     return INTRODUCTION + limits + "".join(line for code, kind in KINDS.items() for line in _section(code, kind))
 
 
-def _limit(unit: str, value: float) -> str:
-    return f"{100.0 * value:g} % of the value" if unit in ("cm", "cm²") else f"{value:g} {unit}"
+def _limit(trait: str, value: float) -> str:
+    return f"{value:g} {UNITS[trait]}" if trait in UNITS else f"{100.0 * value:g} % of the value"
 
 
 def _section(code: str, kind: Kind) -> Iterator[str]:

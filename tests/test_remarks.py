@@ -56,8 +56,11 @@ def test_the_page_in_the_docs_is_that_of_the_table():
     assert [line for line in module.page().splitlines() if line.startswith("## ")][1:] == [f"## {c}" for c in KINDS]
 
 
-def a_trait(half, unit="cm", value=50.0):
-    return Trait("leaf", 1, "leaf_length", value, unit, value - half, value + half)
+UNITS = {t.name: t.unit for t in phytofit.measure(phytofit.simulate(seed=1).organs)}
+
+
+def a_trait(half, name="leaf_length", value=50.0):
+    return Trait("leaf", 1, name, value, UNITS[name], value - half, value + half)
 
 
 def quality_of(trait, *remarks):
@@ -66,20 +69,21 @@ def quality_of(trait, *remarks):
 
 
 @given(st.sampled_from(list(LIMITS)), st.floats(0.0, 300.0), st.floats(0.0, 300.0), st.floats(1.0, 200.0))
-def test_a_wider_interval_is_never_of_better_quality(unit, half, more, value):
-    narrow, wide = (quality_of(a_trait(h, unit, value)) for h in (half, half + more))
+def test_a_wider_interval_is_never_of_better_quality(name, half, more, value):
+    narrow, wide = (quality_of(a_trait(h, name, value)) for h in (half, half + more))
     assert ORDER.index(wide) <= ORDER.index(narrow)
 
 
-@pytest.mark.parametrize("unit", LIMITS)
-def test_limits_are_as_their_table_says_and_do_not_ask_for_a_unit_of_length(unit):
+@pytest.mark.parametrize("name", TRAITS)
+def test_limits_are_as_their_table_says_and_do_not_ask_for_a_unit_of_length(name):
     value = 50.0
-    scale = value if unit.startswith("cm") else 1.0
-    check, poor = (limit * scale for limit in LIMITS[unit])
+    scale = value if UNITS[name].startswith("cm") else 1.0
+    check, poor = (limit * scale for limit in LIMITS[name])
     for half, quality in ((0.99 * check, "good"), (1.01 * check, "check"), (1.01 * poor, "poor")):
-        assert quality_of(a_trait(half, unit)) == quality
-        assert quality_of(a_trait(half, unit.replace("cm", "rel"))) == quality
-        small = a_trait(1e-3 * half if scale == value else half, unit, 1e-3 * value)
+        trait = a_trait(half, name)
+        assert quality_of(trait) == quality
+        assert quality_of(dataclasses.replace(trait, unit=trait.unit.replace("cm", "rel"))) == quality
+        small = a_trait(1e-3 * half if scale == value else half, name, 1e-3 * value)
         assert quality_of(small) == quality
 
 

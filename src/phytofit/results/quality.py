@@ -8,15 +8,24 @@ from phytofit.traits import Trait
 
 __all__ = ["LIMITS", "graded", "half_width", "of_intervals"]
 
-# Half of an interval, from which on a trait is to be checked, and from which on it is poor: of lengths and areas
-# shares of the value, of angles degrees, of curvature degrees per cm.  Chosen by what the numbers are used for:
+# Half of an interval, from which on a trait is to be checked, and from which on it is poor: of lengths and areas shares
+# of the value, of angles degrees, of curvature degrees per cm.  Chosen by what the numbers are used for:
+ALONG = (0.08, 0.30)  # a tape along the midrib repeats within 2 to 5 %; a third off, a short leaf is a long one
+ACROSS = (0.20, 0.40)  # widths of a blade differ by a fifth from fold to fold and from hand to hand
+AREA = (0.20, 0.50)  # length and width together
+ANGLE = (15.0, 35.0)  # deg; cultivars differ by 10 to 20, erect leaves from level ones by 60
+TURNING = (0.6, 1.5)  # deg/cm; of a leaf of 50 cm, 30 and 75 degrees from base to tip
 LIMITS = {
-    "cm": (0.10, 0.35),  # hand measures repeat within 2 to 5 %; a third off, a short leaf is a long one
-    "cm²": (0.15, 0.50),  # length and width together
-    "deg": (8.0, 25.0),  # cultivars differ by some 10 degrees, erect leaves from level ones by 60
-    "deg/cm": (0.4, 1.2),  # of a leaf of 50 cm, 20 and 60 degrees from base to tip
+    "leaf_length": ALONG,
+    "stem_length": ALONG,
+    "leaf_width": ACROSS,
+    "stem_diameter": ACROSS,
+    "leaf_area": AREA,
+    "leaf_angle": ANGLE,
+    "leaf_insertion_angle": ANGLE,
+    "leaf_curvature": TURNING,
 }
-RELATIVE = ("cm", "cm²")
+RELATIVE = ("cm", "cm²", "rel", "rel²")
 
 
 def half_width(trait: Trait) -> float | None:
@@ -26,7 +35,7 @@ def half_width(trait: Trait) -> float | None:
     if not ends:
         return None
     half = sum(ends) / len(ends)
-    return half / max(abs(trait.value), 1e-12) if _kind(trait) in RELATIVE else half
+    return half / max(abs(trait.value), 1e-12) if trait.unit in RELATIVE else half
 
 
 def of_intervals(traits: Sequence[Trait]) -> Iterator[Remark]:
@@ -53,11 +62,7 @@ def graded(traits: Iterable[Trait], remarks: Sequence[Remark]) -> list[Trait]:
 
 def _by_width(trait: Trait) -> str:
     half = half_width(trait)
-    if half is None or _kind(trait) not in LIMITS:
+    if half is None or trait.name not in LIMITS:
         return ""
-    check, poor = LIMITS[_kind(trait)]
+    check, poor = LIMITS[trait.name]
     return POOR if half > poor else CHECK if half > check else GOOD
-
-
-def _kind(trait: Trait) -> str:
-    return trait.unit.replace("rel", "cm")

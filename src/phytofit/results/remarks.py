@@ -91,8 +91,8 @@ KINDS = {
         CHECK,
         "the leaf's tip may be missing: the leaf may be longer",
         "Look at the tip in fit.png",
-        "A leaf that goes on explains the points better, but not clearly; or points lie beyond the fitted tip. The "
-        "intervals of length and area have no upper end.",
+        "A leaf that goes on explains the points better, but not clearly. The intervals of length and area have no "
+        "upper end.",
     ),
     "tip_blunt": Kind(
         LENGTHS,
@@ -115,7 +115,8 @@ KINDS = {
         CHECK,
         "{n} points lie beyond the fitted tip: the leaf may be longer",
         "Look at the tip in fit.png",
-        "Clearly more points than stray ones lie beyond the tip: it bends away sharply, or something touches it.",
+        "Clearly more points than stray ones lie beyond the tip: it bends away sharply, or something touches it. The "
+        "intervals of length and area have no upper end.",
         "points lie beyond the fitted tip: the leaf may be longer",
     ),
     # the leaf
@@ -255,16 +256,23 @@ KINDS = {
     ),
     "at_limit": Kind(
         (),
-        CHECK,
+        POOR,
         "{parameter} is at the limit of the species, {value}",
         "Check the unit, or widen the limit in a species file",
-        "The species' bound stopped the search. Touches the traits that follow from the parameter. At a limit of the "
-        "leaf's own shape (twist, roll, bend), points of something else may be in the fit.",
+        "The species' bound stopped the search. Touches the traits that follow from the parameter.",
         "a parameter is at the limit of the species",
+    ),
+    "shape_at_limit": Kind(
+        LEAF,
+        CHECK,
+        "{parameter} is at the limit of the species, {value}",
+        "See in fit.png whether this is one leaf, or widen the limit in a species file",
+        "The leaf twists, rolls or bends as far as the species allows: points of something else may be in the fit.",
+        "the leaf's shape is at the limit of the species",
     ),
     "unusual": Kind(
         (),
-        CHECK,
+        POOR,
         "{parameter} of {value} is unusual for the species",
         "Check the unit, and in fit.png whether this is one leaf on its stem",
         "A parameter lies more than four standard deviations from the species' mean. Touches the traits that follow "

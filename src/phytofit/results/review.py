@@ -36,7 +36,7 @@ THICK_STEM = (
 NO_LEAF = "no leaf in this cloud: what looks most like one is as short as a leaf of {} can be, {:g} cm; check the unit"
 SEVERAL_LEAVES = f"this looks like a whole plant, or more than one leaf: {{}}; {ONE_LEAF_ONLY}"
 COMPARED = ("stem_diameter", "leaf_length", "leaf_angle", "leaf_width")  # with those of a rival
-FOLLOWS = {  # the traits that follow from a parameter; from the leaf's own shape, all of the leaf's
+FOLLOWS = {  # the traits that follow from a parameter
     "stem_diameter": ("stem_diameter",),
     "stem_diameter_above": ("stem_diameter",),
     "leaf_angle": ("leaf_angle", "leaf_insertion_angle"),
@@ -82,10 +82,10 @@ def _of_the_tip(result: Fit) -> Iterator[Remark]:
         yield remark("tip_blunt")
     if made.too_long and made.ends_at < 1.0:
         yield remark("tip_cut_back", share=_percent(1.0 - made.ends_at), n=f"{seen.short:.0f}")
-    elif made.seen == 1.0 and not made.blunt and not made.tip_seen:
-        yield remark("tip_doubtful")
     if seen.beyond:
         yield remark("tip_exceeded", n=f"{seen.beyond:.0f}")
+    elif made.seen == 1.0 and not (made.blunt or made.too_long or made.tip_seen):
+        yield remark("tip_doubtful")
 
 
 def _of_what_was_seen(result: Fit, seen: Sighting) -> Iterator[Remark]:
@@ -125,12 +125,13 @@ def _of_the_prior(result: Fit) -> Iterator[Remark]:
     names = result.species.space.names
     for p, x in zip(result.species.space.parameters, result.x.tolist(), strict=True):
         value = f"{x * result.scale:.3g} {_length_unit(result)}" if p.unit == "cm" else f"{x:.3g} {p.unit}"
-        traits = FOLLOWS.get(p.name, LEAF)
+        traits = FOLLOWS.get(p.name)
         along_stem = p.name == "leaf_angle" and x == p.lower and "leaf_base_bend" in names  # as leaves may be
         at_bound = min(x - p.lower, p.upper - x) < NEAR_BOUND and not along_stem
         if at_bound and (p.name in FOLLOWS or p.unit == "deg"):  # a share may be 0 or 1; no angle is the greatest
-            yield remark("at_limit", traits=traits, parameter=p.name, value=value)
-        elif p.name in FOLLOWS and abs(x - p.mean) > IMPLAUSIBLE * p.std:
+            code = "shape_at_limit" if traits is None else "at_limit"
+            yield remark(code, traits=traits, parameter=p.name, value=value)
+        elif traits is not None and abs(x - p.mean) > IMPLAUSIBLE * p.std:
             yield remark("unusual", traits=traits, parameter=p.name, value=value)
 
 
