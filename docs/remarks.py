@@ -24,6 +24,7 @@ of these remarks, with `;` between them. To keep what is good in R or pandas, fi
 The screen, `fit.json` and the pictures say each remark in full, with what to do.
 
 A good trait can still be wrong: look at the picture.
+[How accurate, how robust, how fast](accuracy.md#quality) says how large the errors are of each quality.
 
 ## Intervals
 
