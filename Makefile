@@ -4,7 +4,7 @@ BIN := .venv/bin
 EACH_CORE := --numprocesses auto --dist loadfile
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: install demo test test-long check bench bench-accuracy bench-segment paper pictures docs
+.PHONY: install demo test test-long coverage check bench bench-accuracy bench-segment paper pictures docs
 
 install: .venv/installed
 
@@ -23,6 +23,14 @@ test: install
 
 test-long: install
 	$(BIN)/python -m pytest $(EACH_CORE) -m 'long or not long'
+
+# Lines that `make test` runs: the total and the ten files with the least. Kernels are compiled, can't be traced, and count
+# in no figure; what tests run in a process of its own isn't seen either.
+coverage: install
+	$(BIN)/python -m pytest $(EACH_CORE) --cov --cov-report=
+	$(BIN)/python -m coverage report --sort=cover --skip-empty > .coverage.txt
+	head -12 .coverage.txt
+	tail -1 .coverage.txt
 
 check: install
 	$(BIN)/ruff check
