@@ -235,9 +235,10 @@ def test_a_parameter_at_its_bound_is_flagged(made):
 
 def test_an_angle_of_a_leafs_own_shape_at_its_bound_is_flagged():
     aside = phytofit.simulate(fixed=GENTLE | {"leaf_side_bend": 45.0}, n_points=N_POINTS, noise_cm=0.3, seed=7)
-    said = "leaf_side_bend is at the limit of the species, 20 deg. Check the unit, or widen the limit in a species file"
-    assert says(phytofit.fit(aside.points, "cm", species=bounded("leaf_side_bend", upper=20.0), threads=2), said)
-    assert "at_limit" not in phytofit.fit(aside.points, "cm", threads=2).flags
+    found = phytofit.fit(aside.points, "cm", species=bounded("leaf_side_bend", upper=20.0), threads=2)
+    assert says(found, "leaf_side_bend is at the limit of the species, 20 deg")
+    assert {t.organ for t in found.traits if "shape_at_limit" in t.flags} == {"leaf"}
+    assert "shape_at_limit" not in phytofit.fit(aside.points, "cm", threads=2).flags
 
 
 def test_a_cloud_without_noise_is_fitted():
