@@ -309,3 +309,17 @@ def test_a_foreign_cloud_lies_on_its_surface_and_comes_back():
 def test_foreign_benchmark_runs():
     said = run("foreign.py", "grid", "--leaves", "2")
     assert "leaf_insertion_angle" in said
+
+
+def test_the_discrepancy_is_learned_of_errors_beyond_their_intervals():
+    """Of leaves whose every trait is off by one parameter each: of known spreads, with noise of known size."""
+    discrepancy = load("discrepancy")
+    random = np.random.default_rng(3)
+    true = np.array([0.04, 3.0, 0.02, 0.05, 8.0])
+    leaves = []
+    for _ in range(400):
+        change = np.zeros((6, 5))
+        change[[0, 1, 2, 3, 4, 5], [2, 1, 4, 3, 3, 0]] = [50.0, 1.0, 1.0, 6.0, 200.0, 3.0]
+        off, std = true * random.standard_normal(5), np.abs(change).sum(axis=1) * 0.01
+        leaves.append(discrepancy.Leaf(change @ off + std * random.standard_normal(6), std, change))
+    np.testing.assert_allclose(discrepancy.learned(leaves), true, rtol=0.25)

@@ -7,7 +7,7 @@ import pytest
 
 import phytofit
 from phytofit.engine.covariance import covariance_of, misfit_of, mixed
-from phytofit.engine.dependence import NONE, Bell, Dependence, score_dependence
+from phytofit.engine.dependence import NONE, Dependence, GaussianCorrelation, score_dependence
 from phytofit.engine.posterior import Posterior
 from phytofit.engine.refine import refinement
 from phytofit.engine.scoring import refine
@@ -38,11 +38,11 @@ def test_the_error_where_one_of_two_models_is_right():
 
 def test_errors_that_stem_and_leaf_share_are_no_misfit_of_the_blade():
     assert misfit_of(dependence(NONE, NONE), NOISE) == 0.0
-    assert misfit_of(dependence(NONE, Bell(0.36, 1.0)), NOISE) == pytest.approx(0.6 * 0.5)
-    sensor = Bell(0.9, 1.0)
+    assert misfit_of(dependence(NONE, GaussianCorrelation(0.36, 1.0)), NOISE) == pytest.approx(0.6 * 0.5)
+    sensor = GaussianCorrelation(0.9, 1.0)
     assert misfit_of(dependence(sensor, sensor), np.array([0.5, 0.5, 0.0])) == 0.0
-    assert misfit_of(dependence(sensor, Bell(0.2, 1.0)), np.full(3, 0.2)) == 0.0  # not less than none
-    both = misfit_of(dependence(Bell(0.5, 1.0), Bell(0.5, 1.0)), NOISE)
+    assert misfit_of(dependence(sensor, GaussianCorrelation(0.2, 1.0)), np.full(3, 0.2)) == 0.0  # not less than none
+    both = misfit_of(dependence(GaussianCorrelation(0.5, 1.0), GaussianCorrelation(0.5, 1.0)), NOISE)
     assert both == pytest.approx(np.sqrt(0.5 * (0.25 - 0.09)))
 
 

@@ -5,7 +5,14 @@ import pytest
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 
-from phytofit.engine.dependence import NONE, Bell, _before_the_fit, _correlation, score_dependence, width_misfit
+from phytofit.engine.dependence import (
+    NONE,
+    GaussianCorrelation,
+    _before_the_fit,
+    _correlation,
+    score_dependence,
+    width_misfit,
+)
 from phytofit.engine.layout import State
 from phytofit.engine.posterior import Posterior
 from phytofit.engine.refine import refinement
@@ -269,6 +276,6 @@ def test_width_misfit_is_beyond_what_shared_noise_does():
     for seed in range(4):
         likelihood, state = scene(seed, n=1500, width_cm=1.0, share=1.0, noise_cm=1.0)
         at = likelihood.evaluate(state)
-        found.append([width_misfit(likelihood, state, at, bell) for bell in (NONE, Bell(1.0, 1.4))])
+        found.append([width_misfit(likelihood, state, at, bell) for bell in (NONE, GaussianCorrelation(1.0, 1.4))])
     alone, shared = np.mean(found, axis=0)
     assert shared < 0.5 * alone

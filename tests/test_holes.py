@@ -5,6 +5,7 @@ import pytest
 from scipy.stats import ttest_1samp
 
 import phytofit
+from own_leaves import OWN_LEAVES
 from phytofit.engine.holes import find_holes
 from phytofit.engine.posterior import Posterior
 from phytofit.engine.visibility import Hidden, cells
@@ -144,7 +145,7 @@ def test_intervals_know_that_a_hole_may_end_elsewhere(monkeypatch):
     _, points = made(3, (0.25, 0.6, -0.55, 0.55))
 
     def spread():
-        width = next(t for t in phytofit.fit(points, "cm").traits if t.name == "leaf_width")
+        width = next(t for t in phytofit.fit(points, "cm", species=OWN_LEAVES).traits if t.name == "leaf_width")
         return width.high - width.low
 
     known = spread()

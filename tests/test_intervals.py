@@ -1,5 +1,7 @@
 """Intervals of what is measured on fitted parameters, against closed forms and draws."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
@@ -9,6 +11,7 @@ import phytofit
 from phytofit.engine.dependence import NONE, width_misfit
 from phytofit.engine.intervals import covariance_of_independent, propagated
 from phytofit.engine.posterior import Posterior
+from phytofit.parameters import ParameterSpace
 
 ROUNDING = 1e-9
 DRAWN = 0.05  # relative; quantiles of a hundred thousand draws, and what is lost by looking along axes only
@@ -137,3 +140,30 @@ def test_the_end_of_a_blurred_line_is_within_its_interval_as_often_as_it_should(
     ours, outer = np.mean(held, axis=0)
     assert ours == pytest.approx(0.95, abs=0.03)
     assert outer < ours - 0.02
+
+
+def test_intervals_of_traits_know_the_discrepancy_of_real_organs_and_those_of_parameters_do_not():
+    """The closed form for traits that are a parameter times a constant, as diameter and width are."""
+    made = phytofit.simulate(fixed={"leaf_length": 50.0, "leaf_width": 6.0}, n_points=2000, noise_cm=0.4, seed=3)
+    species = phytofit.load_species()
+
+    def fitted(discrepancy):
+        parameters = [
+            replace(p, discrepancy=discrepancy if p.name in ("leaf_width", "stem_diameter") else 0.0)
+            for p in species.space.parameters
+        ]
+        return phytofit.fit(made.points, "cm", species=replace(species, space=ParameterSpace(parameters)), threads=2)
+
+    none, some = fitted(0.0), fitted(0.05)
+    assert none.parameter_intervals == some.parameter_intervals
+    half = {name: _half(none, name) for name in ("leaf_width", "stem_diameter", "leaf_angle")}
+    quantile = none.estimate.quantile
+    for name in ("leaf_width", "stem_diameter"):
+        added = quantile * 0.05 * next(t.value for t in none.traits if t.name == name)
+        assert _half(some, name) == pytest.approx(np.hypot(half[name], added), rel=1e-3)
+    assert half["leaf_angle"] < _half(some, "leaf_angle") < 1.5 * half["leaf_angle"]  # a thicker stem moves the base
+
+
+def _half(result, name):
+    trait = next(t for t in result.traits if t.name == name)
+    return 0.5 * (trait.high - trait.low)

@@ -72,3 +72,20 @@ def test_a_space_is_a_value():
         space.parameters = ()
     space.mean[0] = 99.0  # a fresh array every time: nothing written to it comes back
     assert space.mean[0] == 6.0
+
+
+def test_a_discrepancy_is_a_share_of_lengths_and_absolute_of_the_rest():
+    space = ParameterSpace(
+        [
+            Parameter("length", "cm", 50.0, 10.0, discrepancy=0.02),
+            Parameter("angle", "deg", 0.0, 10.0, discrepancy=3.0),
+            Parameter("other", "cm", 5.0, 1.0),
+        ]
+    )
+    np.testing.assert_allclose(space.discrepancy_at(np.array([-40.0, 25.0, 4.0])), [0.8, 3.0, 0.0])
+
+
+@pytest.mark.parametrize("discrepancy", [-0.1, np.inf, np.nan])
+def test_a_discrepancy_is_a_standard_deviation(discrepancy):
+    with pytest.raises(SettingError, match="discrepancy"):
+        Parameter("length", "cm", 50.0, 10.0, discrepancy=discrepancy)

@@ -9,7 +9,7 @@ import phytofit
 import phytofit.models
 import phytofit.simulation
 from phytofit.engine import search as posterior
-from phytofit.engine.dependence import Bell, Dependence
+from phytofit.engine.dependence import Dependence, GaussianCorrelation
 from phytofit.engine.posterior import Posterior
 from phytofit.engine.refine import Cloud, Optimum, optimum_near
 from phytofit.engine.restarts import along_points, longer_leaf, longer_stem, lower_insertion, turned_blade
@@ -421,12 +421,16 @@ def test_misfit_does_not_speak_for_the_poorer_model(on_stem, monkeypatch, wavy_e
     assert gain > 300.0
 
     def inflated(likelihood, state, known=None):
-        bells = (Bell(on_stem, 5.0), Bell(0.6, 5.0)) if known is None else (known.stem, known.leaf)
+        bells = (
+            (GaussianCorrelation(on_stem, 5.0), GaussianCorrelation(0.6, 5.0))
+            if known is None
+            else (known.stem, known.leaf)
+        )
         inflation = gain if bells[1].correlation else 1.0
         return Dependence(np.eye(len(state.theta)), inflation, len(points) / inflation, *bells)
 
     monkeypatch.setattr(posterior, "score_dependence", inflated)
-    assert len(posterior._choice(ends).end.state.x) == (7 if on_stem else len(NAMES))
+    assert len(posterior._choice(ends).optimum.state.x) == (7 if on_stem else len(NAMES))
 
 
 def test_a_leaf_that_lies_off_its_model_may_start_further_down():

@@ -33,7 +33,7 @@ def made(code, **values):
     return remark(code, **(dict.fromkeys(fields_of(KINDS[code].text), "x") | values))
 
 
-@pytest.mark.parametrize("code", KINDS)
+@pytest.mark.parametrize("code", sorted(KINDS))
 def test_a_kind_is_a_code_with_sentences_and_traits_that_there_are(code):
     kind = KINDS[code]
     assert re.fullmatch(r"[a-z]+(_[a-z]+)*", code)
@@ -74,7 +74,7 @@ def test_a_wider_interval_is_never_of_better_quality(name, half, more, value):
     assert ORDER.index(wide) <= ORDER.index(narrow)
 
 
-@pytest.mark.parametrize("name", TRAITS)
+@pytest.mark.parametrize("name", sorted(TRAITS))
 def test_limits_are_as_their_table_says_and_do_not_ask_for_a_unit_of_length(name):
     value = 50.0
     scale = value if UNITS[name].startswith("cm") else 1.0

@@ -1,5 +1,6 @@
 """Species files: what ships loads, the order in the file does not matter, every mistake is named."""
 
+import re
 import tomllib
 from importlib import resources
 
@@ -12,6 +13,7 @@ from phytofit.models import Phytomer
 from phytofit.species import load_species
 
 SORGHUM = (resources.files("phytofit") / "species" / "sorghum.toml").read_text(encoding="utf-8")
+SORGHUM = re.sub(r"discrepancy = .*\n", "", SORGHUM)
 
 
 @pytest.fixture
@@ -190,3 +192,11 @@ def test_what_is_no_text_file(tmp_path):
         load_species(tmp_path / "plant.toml")
     with pytest.raises(SpeciesError, match=r"can't be read \(Is a directory\)"):
         load_species(tmp_path)
+
+
+@pytest.mark.parametrize("value", ["-0.1", "inf", '"much"'])
+def test_a_discrepancy_is_read_or_refused_by_name(written, value):
+    given = "range = [4.0, 8.0]\n"
+    assert load_species(written((given, given + "discrepancy = 0.1\n"))).space.parameters[4].discrepancy == 0.1
+    with pytest.raises(SpeciesError, match="leaf_width.discrepancy"):
+        load_species(written((given, given + f"discrepancy = {value}\n")))

@@ -23,7 +23,7 @@ def base():
 
 def made_up(offsets, n=None, trait="leaf_length", unit="cm"):
     """A trial of truths of 100 whose results are off by so much."""
-    rows = [(f"p{i}", trait, unit, 100.0, 100.0 + off, 90.0, 110.0, "", 1) for i, off in enumerate(offsets)]
+    rows = [(f"p{i}", trait, unit, 100.0, 100.0 + off, 90.0, 110.0, "good", "", 1) for i, off in enumerate(offsets)]
     table = pd.DataFrame(rows, columns=PAIR_COLUMNS)
     return Trial(Comparison(table, ()), len(offsets) if n is None else n, {})
 

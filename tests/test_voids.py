@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import phytofit
+from own_leaves import OWN_LEAVES
 from phytofit.engine.holes import find_holes
 from phytofit.engine.posterior import Posterior
 from phytofit.engine.visibility import Hidden
@@ -133,7 +134,7 @@ def test_what_is_left_is_denser_by_what_the_void_takes_of_each_organ():
 def test_a_hidden_base_is_flagged_and_the_intervals_hold(seed):
     """A leaf and a stem that were given a shape of their own to avoid the empty ball would be off by degrees."""
     true = made(10 + seed)
-    result = phytofit.fit(without_ball(true, around_base(true, seed)), "cm", seed=seed)
+    result = phytofit.fit(without_ball(true, around_base(true, seed)), "cm", species=OWN_LEAVES, seed=seed)
     measured = {t.name: t for t in phytofit.measure(true.organs)}
     assert "base_hidden" in result.flags
     assert len(result.x) == 7

@@ -15,7 +15,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Parameter:
-    """One model parameter: its name and unit, the prior's mean and spread, and hard bounds where nature has them."""
+    """One model parameter: its name and unit, the prior's mean and spread, and hard bounds where nature has them.
+
+    ``discrepancy`` is the standard deviation by which a fit without any noise is off on real organs, whose shape the
+    model does not quite have: a share of the value for lengths (unit cm), else in the parameter's unit.
+    """
 
     name: str
     unit: str
@@ -23,6 +27,7 @@ class Parameter:
     std: float
     lower: float = -np.inf
     upper: float = np.inf
+    discrepancy: float = 0.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.mean) and np.isfinite(self.std) and self.std > 0):
@@ -30,6 +35,8 @@ class Parameter:
                 f"parameter {self.name}: expected a finite mean and a positive std, "
                 f"got mean {self.mean:g} and std {self.std:g}"
             )
+        if not 0.0 <= self.discrepancy < np.inf:
+            raise SettingError(f"parameter {self.name}: expected a discrepancy of 0 or more, got {self.discrepancy:g}")
         if not self.lower <= self.mean <= self.upper or self.lower == self.upper:
             raise SettingError(
                 f"parameter {self.name}: expected lower <= mean <= upper and lower < upper, "
@@ -74,6 +81,11 @@ class ParameterSpace:
     @property
     def upper(self) -> FloatArray:
         return np.array([p.upper for p in self.parameters])
+
+    def discrepancy_at(self, x: FloatArray) -> FloatArray:
+        """Standard deviations (k,) by which the parameters x (k,) of real organs are off, in their units."""
+        share = np.array([p.discrepancy for p in self.parameters])
+        return np.where(np.array(self.units) == "cm", share * np.abs(x), share)
 
     def index(self, name: str) -> int:
         """Position of the parameter called `name` in x; SettingError names the known ones."""

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, pinvh
 
-from phytofit.engine.dependence import Bell, Dependence
+from phytofit.engine.dependence import Dependence, GaussianCorrelation
 from phytofit.engine.intervals import covariance_of_independent
 from phytofit.engine.layout import State
 from phytofit.engine.mixture import Evaluation
@@ -74,7 +74,7 @@ def misfit_of(dependence: Dependence, noise: FloatArray) -> float:
     return float(np.sqrt((everything - sensors) * float(noise[1] ** 2 + noise[2] ** 2)))
 
 
-def of_sensor(dependence: Dependence, noise: FloatArray) -> Bell:
+def of_sensor(dependence: Dependence, noise: FloatArray) -> GaussianCorrelation:
     """How the sensor's errors of neighbours on the leaf are correlated: those that neighbours on the stem share are on
     both, in squares of cm.  ``noise`` (3,) as of a :class:`State`."""
     on_stem = dependence.stem.correlation * float(noise[0] ** 2) / float(noise[1] ** 2 + noise[2] ** 2)

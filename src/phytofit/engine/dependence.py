@@ -37,14 +37,14 @@ N_PIECES, LEAST_ON_PIECE = 15, 40  # of the leaf, whose width is compared with t
 CUT = 2.5  # reaches at which the correlation counts as none
 
 
-class Bell(NamedTuple):
+class GaussianCorrelation(NamedTuple):
     """Correlation of errors over distance: at none, and the standard deviation of its bell, cm; 0 if there is none."""
 
     correlation: float
     reach_cm: float
 
 
-NONE = Bell(0.0, 0.0)
+NONE = GaussianCorrelation(0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -56,8 +56,8 @@ class Dependence:
     variability: FloatArray
     inflation: float
     n_independent: float
-    stem: Bell
-    leaf: Bell
+    stem: GaussianCorrelation
+    leaf: GaussianCorrelation
 
 
 def score_dependence(posterior: Posterior, state: State, known: Dependence | None = None) -> Dependence:
@@ -102,7 +102,10 @@ def score_dependence(posterior: Posterior, state: State, known: Dependence | Non
         whole = _before_the_fit(
             place[sure], errors[sure], [change[sure] for change in changes], information, both.reach_cm
         )
-        bells = [Bell(whole.correlation * bell.correlation / both.correlation, whole.reach_cm) for bell in bells]
+        bells = [
+            GaussianCorrelation(whole.correlation * bell.correlation / both.correlation, whole.reach_cm)
+            for bell in bells
+        ]
     variability, alike = independent.copy(), 0.0
     for organ, bell in zip(organs_of, bells, strict=True):
         if bell == NONE:
@@ -143,7 +146,7 @@ def _change_of_scores(posterior: Posterior, state: State, direction: FloatArray,
     return (there - back) / (2.0 * SHIFT)
 
 
-def width_misfit(posterior: Posterior, state: State, at: Evaluation, bell: Bell) -> float:
+def width_misfit(posterior: Posterior, state: State, at: Evaluation, bell: GaussianCorrelation) -> float:
     """Standard deviation of the leaf's width about the model's, place by place, as a share of it, beyond chance.
 
     Points that are uniform across a strip vary by a third of its half width squared, and by the noise, which neighbours
@@ -220,7 +223,7 @@ class _Products(NamedTuple):
         return height, np.sqrt(self.met / square), misfit
 
 
-def _correlation(points: FloatArray, errors: FloatArray) -> Bell:
+def _correlation(points: FloatArray, errors: FloatArray) -> GaussianCorrelation:
     """The bell that fits the products of errors (n,) of neighbours best, of those that are clear."""
     if len(points) < 2:
         return NONE
@@ -229,13 +232,13 @@ def _correlation(points: FloatArray, errors: FloatArray) -> Bell:
     for reach in REACHES_CM.tolist():
         height, error, misfit = products.height(reach)
         if height > CLEAR * error and misfit < best:
-            best, found = misfit, Bell(min(height, 1.0), reach)
+            best, found = misfit, GaussianCorrelation(min(height, 1.0), reach)
     return found
 
 
 def _before_the_fit(
     points: FloatArray, errors: FloatArray, changes: Sequence[FloatArray], information: FloatArray, left_cm: float
-) -> Bell:
+) -> GaussianCorrelation:
     """The bell of the errors (n,) as they were before a fit took a part of them up, the more of those that reach far.
 
     What is left of errors with covariance C after a fit is (I - H) C (I - H)'.  H, which says how the fit follows the
@@ -271,11 +274,11 @@ def _before_the_fit(
             expected = (correlation * shared + (1.0 - correlation) * white) / at_none
             misfit = float(weight @ (products.mean - expected) ** 2)
             if misfit < best:
-                best, found = misfit, Bell(correlation, reach)
+                best, found = misfit, GaussianCorrelation(correlation, reach)
     return found
 
 
-def _of_organ(points: FloatArray, errors: FloatArray, both: Bell) -> Bell:
+def _of_organ(points: FloatArray, errors: FloatArray, both: GaussianCorrelation) -> GaussianCorrelation:
     """The bell of one organ: that of both, unless its own is clearly lower than half of it (a fit takes up more of the
     errors of the smaller organ)."""
     if len(points) < 2:

@@ -1,4 +1,4 @@
-"""What a cloud says of its phytomer: the end that it backs best, and how well it determines it."""
+"""What a cloud says of its phytomer: the optimum that it backs best, and how well it determines it."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from phytofit.engine.sighting import Sighting, sighting
 from phytofit.engine.tip import gain_of_blunt_end
 from phytofit.engine.whole_pieces import of_whole_pieces
 
-__all__ = ["Chosen", "Elsewhere", "Estimate", "outcome"]
+__all__ = ["Alternative", "Choice", "Estimate", "outcome"]
 
 FloatArray = NDArray[np.float64]
 EXPECTED_BEYOND = 7.0  # points that should lie beyond the last: of a whole leaf 1 in 1,100 has as many
@@ -23,23 +23,23 @@ BLUNTLY = 5.0  # nats by which the last points must say that a leaf ends bluntly
 TAPER = "leaf_taper"  # of a leaf that has one of its own, its last points tell where it ends
 
 
-class Elsewhere(NamedTuple):
+class Alternative(NamedTuple):
     """Where the leaf ends up that is free to start elsewhere than at the stem's surface, and how probable it is."""
 
-    end: Optimum
+    optimum: Optimum
     dependence: Dependence
     probability: float
 
 
-class Chosen(NamedTuple):
-    """The end that the cloud backs best."""
+class Choice(NamedTuple):
+    """The optimum that the cloud backs best."""
 
-    end: Optimum
+    optimum: Optimum
     dependence: Dependence
     tip_doubtful: bool
     blunt: bool
     rival: FloatArray | None
-    elsewhere: Elsewhere | None = None
+    alternative: Alternative | None = None
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Estimate:
     """The maximum of the posterior; beside holes, with the leaf's width as its whole pieces have it.
 
     ``x`` (k,) with ``covariance`` (k, k) of its error; ``trait_covariance`` (k, k) the same, with what the leaf's last
-    points tell of its end; ``pose`` (4, 4) from the model's frame to the cloud's;
+    points tell of its end, and the discrepancy of real organs; ``pose`` (4, 4) from the model's frame to the cloud's;
     ``noise`` (3,) cm: on the stem, on the leaf, and what the leaf's thickness adds across it; ``share`` (3,) of stem,
     leaf and outliers; ``seen``: share of the midrib that was seen, 1 unless the tip is missing; ``tip_seen``: whether
     it clearly is not; ``blunt``: whether a leaf that is taken as whole ends as one without its tip; ``ends_at``: share
@@ -86,13 +86,13 @@ class Estimate:
     sighting: Sighting
 
 
-def outcome(chosen: Chosen) -> Estimate:
-    end, dependence = chosen.end, chosen.dependence
-    posterior, state, at = end.posterior, end.state, end.at
+def outcome(chosen: Choice) -> Estimate:
+    optimum, dependence = chosen.optimum, chosen.dependence
+    posterior, state, at = optimum.posterior, optimum.state, optimum.at
     k = len(state.x)
     covariance, left = covariance_of(posterior, state, at, dependence)
-    if chosen.elsewhere is not None:
-        other, of_other, p = chosen.elsewhere
+    if chosen.alternative is not None:
+        other, of_other, p = chosen.alternative
         there, _ = covariance_of(other.posterior, other.state, other.at, of_other)
         covariance = mixed(covariance, there, other.state.theta - state.theta, p)
     seen = sighting(posterior, state, at)
@@ -101,11 +101,12 @@ def outcome(chosen: Chosen) -> Estimate:
     if state.seen == 1.0 and (too_long or TAPER in posterior.space.names):
         ends = ending(posterior, state, at, covariance, shared_by_neighbors(dependence, state.noise))
     blunt = ends.clearly_shorter and (gain_of_blunt_end(posterior, state, at) > BLUNTLY * dependence.inflation)
-    x, covariance, converged = _with_width_of_whole_pieces(end, dependence, covariance[:k, :k])
+    x, covariance, converged = _with_width_of_whole_pieces(optimum, dependence, covariance[:k, :k])
+    discrepancy = posterior.space.discrepancy_at(x)
     return Estimate(
         x=x,
         covariance=covariance,
-        trait_covariance=covariance + ends.changed[:k, :k],
+        trait_covariance=covariance + ends.changed[:k, :k] + np.diag(discrepancy**2),
         too_long=too_long,
         pose=posterior.pose_of(state),
         noise=state.noise,
@@ -116,7 +117,7 @@ def outcome(chosen: Chosen) -> Estimate:
         ends_at=ends.share,
         log_p=at.log_p,
         error=at.error,
-        evidence=end.log_evidence(dependence.inflation),
+        evidence=optimum.log_evidence(dependence.inflation),
         inflation=dependence.inflation,
         misfit_cm=misfit_of(dependence, state.noise),
         width_misfit=width_misfit(posterior, state, at, of_sensor(dependence, state.noise)),
@@ -129,16 +130,16 @@ def outcome(chosen: Chosen) -> Estimate:
 
 
 def _with_width_of_whole_pieces(
-    end: Optimum, dependence: Dependence, covariance: FloatArray
+    optimum: Optimum, dependence: Dependence, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray, bool]:
     """The model's parameters (k,) and the covariance (k, k) of their error, with the leaf's width as its whole pieces
     have it, and whether both refinements converged; as they are where there are no holes."""
-    k = len(end.state.x)
-    whole = of_whole_pieces(end.posterior, end.state)
+    k = len(optimum.state.x)
+    whole = of_whole_pieces(optimum.posterior, optimum.state)
     if whole is None:
-        return end.state.x.copy(), covariance, end.converged
-    refined = refinement(whole, end.state)
-    state = end.state.at(refined.theta)
+        return optimum.state.x.copy(), covariance, optimum.converged
+    refined = refinement(whole, optimum.state)
+    state = optimum.state.at(refined.theta)
     of_part = score_dependence(whole, state, dependence)
     own, _ = covariance_of(whole, state, whole.evaluate(state), of_part)
-    return state.x.copy(), grown(covariance, own[:k, :k], whole.prior.free[:k]), end.converged and refined.converged
+    return state.x.copy(), grown(covariance, own[:k, :k], whole.prior.free[:k]), optimum.converged and refined.converged

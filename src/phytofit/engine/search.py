@@ -14,7 +14,7 @@ from scipy.special import expit
 from phytofit.engine.covariance import of_sensor
 from phytofit.engine.dependence import score_dependence
 from phytofit.engine.layout import State
-from phytofit.engine.outcome import Chosen, Elsewhere, Estimate, outcome
+from phytofit.engine.outcome import Alternative, Choice, Estimate, outcome
 from phytofit.engine.posterior import Posterior
 from phytofit.engine.refine import (
     COARSE_TOLERANCE,
@@ -41,7 +41,7 @@ HELD_OUTLIERS, HELD_ITERATIONS = 0.1, 12  # at most, then, for each point of the
 HOPELESS = 0.3  # nats for each point, by which a start is behind after the first
 START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some cm off is drawn in
 CUT_SHARES = (0.85, 0.97)  # of the midrib, from which the search for a missing tip starts; the second of rich leaves
-SHAPE_PROMISE = 12.0  # nats for which a richer leaf is tried: fourteen parameters gain seven by chance, and cost more
+LEAST_GAIN = 12.0  # nats for which a richer leaf is tried: fourteen parameters gain seven by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning must fit better
 ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
@@ -115,7 +115,7 @@ def _candidates(plain: Species, species: Species, cloud: Cloud, state: State) ->
     if len(plain.space) == len(species.space):
         return found
     simple = found[1] if found[1].log_likelihood - found[0].log_likelihood > TIP_MISSING else found[0]
-    if _promise(species, simple, cloud) <= SHAPE_PROMISE:
+    if _expected_gain(species, simple, cloud) <= LEAST_GAIN:
         return found
     rich = _rich(species, cloud, found[0])
     if rich[0].posterior.void is not found[0].posterior.void:  # all are to have the same
@@ -124,9 +124,9 @@ def _candidates(plain: Species, species: Species, cloud: Cloud, state: State) ->
     return [*found, *rich]
 
 
-def _void_alone(end: Optimum) -> Hidden | None:
+def _void_alone(optimum: Optimum) -> Hidden | None:
     """What was not seen around the leaf's base, for a model that is to find its holes itself."""
-    hidden = end.posterior.hidden
+    hidden = optimum.posterior.hidden
     return None if hidden is None or hidden.void is None else hidden.without_holes()
 
 
@@ -178,7 +178,7 @@ def _better(species: Species, cloud: Cloud, best: Optimum, restart: Callable[[Op
     return best
 
 
-def _choice(found: Sequence[Optimum]) -> Chosen:
+def _choice(found: Sequence[Optimum]) -> Choice:
     """Of models whole and with the tip missing, in turn, the one with the most evidence; a tip is missing only where
     that makes the points clearly more probable.
 
@@ -190,16 +190,16 @@ def _choice(found: Sequence[Optimum]) -> Chosen:
     if sensors.correlation < dependence.leaf.correlation:  # the rest is misfit, of which a better model has less
         without = replace(dependence, leaf=sensors)
         inflation = score_dependence(richest.posterior, richest.state, without).inflation
-    fits = [end.log_likelihood / dependence.inflation for end in found]
+    fits = [optimum.log_likelihood / dependence.inflation for optimum in found]
     gains = [0.0] * len(found)  # by a missing tip
     for whole in range(0, len(found), 2):
         gain = fits[whole + 1] - fits[whole]
         if gain > TIP_DOUBTFUL:  # if the leaf's end says so too, not only its shape elsewhere
-            end = found[whole]
-            gain = min(gain, gain_of_blunt_end(end.posterior, end.state, end.at) / dependence.inflation)
+            optimum = found[whole]
+            gain = min(gain, gain_of_blunt_end(optimum.posterior, optimum.state, optimum.at) / dependence.inflation)
         gains[whole] = gains[whole + 1] = gain
     odds = [0.0, 0.0, RARE, RARE]
-    evidence = [end.log_evidence(inflation) + o for end, o in zip(found, odds, strict=False)]
+    evidence = [optimum.log_evidence(inflation) + o for optimum, o in zip(found, odds, strict=False)]
     backed = [e if i % 2 == 0 or gains[i] > TIP_MISSING else -np.inf for i, e in enumerate(evidence)]
     best = int(np.argmax(backed))
     others = [i for i in range(len(found)) if i // 2 != best // 2 and backed[i] > backed[best] - ABOUT_AS_PROBABLE]
@@ -209,66 +209,66 @@ def _choice(found: Sequence[Optimum]) -> Chosen:
     if best < len(found) - 1:
         dependence = score_dependence(found[best].posterior, found[best].state, dependence)
     doubtful = best % 2 == 0 and gains[best] > TIP_DOUBTFUL
-    return Chosen(found[best], dependence, doubtful, blunt, rival)
+    return Choice(found[best], dependence, doubtful, blunt, rival)
 
 
-def _one_sided(chosen: Chosen) -> Chosen:
+def _one_sided(chosen: Choice) -> Choice:
     """Of a stem that was seen from one side, the fit that knows it, where it has more evidence."""
-    one_sided = chosen.end.posterior
+    one_sided = chosen.optimum.posterior
     free = one_sided.under(one_sided.prior.one_sided())
-    refined = refinement(free, chosen.end.state)
-    there = chosen.end.state.at(refined.theta)
+    refined = refinement(free, chosen.optimum.state)
+    there = chosen.optimum.state.at(refined.theta)
     if np.linalg.norm(there.facing) < LEAST_FACING:
         return chosen
-    end = Optimum(free, there, free.evaluate(there), refined.converged)
-    lead = end.log_evidence(chosen.dependence.inflation) - chosen.end.log_evidence(chosen.dependence.inflation)
+    optimum = Optimum(free, there, free.evaluate(there), refined.converged)
+    lead = optimum.log_evidence(chosen.dependence.inflation) - chosen.optimum.log_evidence(chosen.dependence.inflation)
     if lead < 0.0:
         return chosen
-    return chosen._replace(end=end, dependence=score_dependence(free, there))
+    return chosen._replace(optimum=optimum, dependence=score_dependence(free, there))
 
 
-def _with_hidden_base(chosen: Chosen) -> Chosen:
+def _with_hidden_base(chosen: Choice) -> Choice:
     """Where a leaf starts, if that was not seen, as the prior has it beside what the rest of the leaf says: its points
     count as fewer for that, since they err alike, by noise or as the model does not fit them."""
-    end, inflation = chosen.end, chosen.dependence.inflation
-    if OFFSET not in end.posterior.space.names or inflation == 1.0:
+    optimum, inflation = chosen.optimum, chosen.dependence.inflation
+    if OFFSET not in optimum.posterior.space.names or inflation == 1.0:
         return chosen
-    if sighting(end.posterior, end.state, end.at).shows_base:
+    if sighting(optimum.posterior, optimum.state, optimum.at).shows_base:
         return chosen
-    careful = end.posterior.under(end.posterior.prior.weighted(end.state.layout.mask(*OF_START), inflation))
-    refined = refinement(careful, end.state)
-    there = end.state.at(refined.theta)
+    careful = optimum.posterior.under(optimum.posterior.prior.weighted(optimum.state.layout.mask(*OF_START), inflation))
+    refined = refinement(careful, optimum.state)
+    there = optimum.state.at(refined.theta)
     return chosen._replace(
-        end=Optimum(careful, there, careful.evaluate(there), refined.converged),
+        optimum=Optimum(careful, there, careful.evaluate(there), refined.converged),
         dependence=score_dependence(careful, there, chosen.dependence),
     )
 
 
-def _at_surface(species: Species, chosen: Chosen) -> Chosen:
+def _at_surface(species: Species, chosen: Choice) -> Choice:
     """Of a leaf that rises along its stem, a little inside it, the one that starts at its surface, if that is the more
     probable: there leaves grow, and a cloud hardly tells."""
-    free, state = chosen.end.posterior, chosen.end.state
+    free, state = chosen.optimum.posterior, chosen.optimum.state
     if not along_stem(free, state):
         return chosen
     at_surface = state.changed(**{OFFSET: 1.0})
     held = free.under(free.prior.fixing(at_surface.theta, state.layout.mask(OFFSET)))
     refined = refinement(held, at_surface)
     there = state.at(refined.theta)
-    end = Optimum(held, there, held.evaluate(there), refined.converged)
-    lead = end.log_evidence(chosen.dependence.inflation) - chosen.end.log_evidence(chosen.dependence.inflation)
+    optimum = Optimum(held, there, held.evaluate(there), refined.converged)
+    lead = optimum.log_evidence(chosen.dependence.inflation) - chosen.optimum.log_evidence(chosen.dependence.inflation)
     if lead < 0.0:
         return chosen
     return chosen._replace(
-        end=end,
+        optimum=optimum,
         dependence=score_dependence(held, there, chosen.dependence),
-        elsewhere=Elsewhere(chosen.end, chosen.dependence, float(expit(-lead))),
+        alternative=Alternative(chosen.optimum, chosen.dependence, float(expit(-lead))),
     )
 
 
-def _promise(species: Species, end: Optimum, cloud: Cloud) -> float:
+def _expected_gain(species: Species, optimum: Optimum, cloud: Cloud) -> float:
     """Log probability that a richer leaf is expected to gain over the fitted one, by Rao's score test."""
-    posterior = cloud.posterior(species, cut=True, hidden=end.posterior.hidden)
-    state = posterior.extended(end.state).changed(leaf_thickness=end.state["leaf_thickness"])
+    posterior = cloud.posterior(species, cut=True, hidden=optimum.posterior.hidden)
+    state = posterior.extended(optimum.state).changed(leaf_thickness=optimum.state["leaf_thickness"])
     _, gradient, information = terms(posterior, state)
     free = ~state.layout.mask("midrib_seen")  # the tip is another question
     inverse = pinvh(information[np.ix_(free, free)])  # with labels, points may say nothing of a share

@@ -130,12 +130,12 @@ def tube_density(
             along = from_foot - from_top
             if along <= 0.0:
                 continue
-            pull_v, pull_w = r * v / square + facing_v, r * w / square + facing_w
-            pull = np.sqrt(pull_v * pull_v + pull_w * pull_w)
-            bessel, ratio = _bessel(pull)
-            ratio = ratio / pull if pull > 0.0 else 0.5
+            tilt_v, tilt_w = r * v / square + facing_v, r * w / square + facing_w
+            tilt = np.sqrt(tilt_v * tilt_v + tilt_w * tilt_w)
+            bessel, ratio = _bessel(tilt)
+            ratio = ratio / tilt if tilt > 0.0 else 0.5
             gap = rho - r
-            exponent = pull - rho * r / square - one_sided - 0.5 * gap * gap / square
+            exponent = tilt - rho * r / square - one_sided - 0.5 * gap * gap / square
             around = np.exp(exponent) * bessel / (2.0 * np.pi * square * at_all_sides)
             here = weight[i] * 2.0 * np.pi * r / area * around * along
             if here <= 0.0:
@@ -146,10 +146,10 @@ def tube_density(
                 at_top /= noise * along
                 by_u = here * (at_foot - at_top)
                 by_length = here * at_top
-                towards = ratio * (pull_v * v + pull_w * w)
+                towards = ratio * (tilt_v * v + tilt_w * w)
                 by_half = 0.5 * here * ((towards - r) / square + 1.0 / r)
-                by_v = here * (r * ratio * pull_v - v) / square
-                by_w = here * (r * ratio * pull_w - w) / square
+                by_v = here * (r * ratio * tilt_v - v) / square
+                by_w = here * (r * ratio * tilt_w - w) / square
                 shift = change[j]
                 for c in range(k):
                     derivative[i, c] += (
@@ -160,8 +160,8 @@ def tube_density(
                         - by_w * (shift[2, c] + shift[3, c] * v - shift[4, c] * u)
                         - here * area_change[c]
                     )
-                derivative[i, k] += here * (ratio * pull_v - mean_facing * facing_v)
-                derivative[i, k + 1] += here * (ratio * pull_w - mean_facing * facing_w)
+                derivative[i, k] += here * (ratio * tilt_v - mean_facing * facing_v)
+                derivative[i, k + 1] += here * (ratio * tilt_w - mean_facing * facing_w)
                 derivative[i, k + 2] += here * (
                     -2.0 + (rho * rho + r * r - 2.0 * r * towards) / square - (u * at_foot - (u - long) * at_top)
                 )
@@ -220,8 +220,8 @@ def strip_density(
             at_start /= std * along
             at_end /= std * along
             # the half width is taken where the point comes from on average, given u
-            pull = at_start - at_end
-            s = min(max((u + square * pull) / long, 0.0), 1.0)
+            drift = at_start - at_end
+            s = min(max((u + square * drift) / long, 0.0), 1.0)
             wide = half[j] + s * slope
             to_right, to_left = right * wide - v, left * wide + v  # from the edges
             until_right, at_right = _normal(to_right / std)
@@ -244,13 +244,13 @@ def strip_density(
                 by_noise = (
                     thin * by_thickness
                     - spread
-                    + by_place * (square * pull * (1.0 + spread) + u * u * at_start - (u - long) ** 2 * at_end)
+                    + by_place * (square * drift * (1.0 + spread) + u * u * at_start - (u - long) ** 2 * at_end)
                     - (to_right * at_right + to_left * at_left)
                 )
-                by_u = here * (pull + by_place * (1.0 - spread - square * pull * pull))
+                by_u = here * (drift + by_place * (1.0 - spread - square * drift * drift))
                 by_v *= here
                 by_w = -here * w / (thickness * thickness)
-                by_length = here * (at_end - by_place * (((u - long) + square * pull) * at_end + s))
+                by_length = here * (at_end - by_place * (((u - long) + square * drift) * at_end + s))
                 by_first, by_second = here * by_half * (1.0 - s), here * by_half * s
                 shift = change[j]
                 for c in range(k):

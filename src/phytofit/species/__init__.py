@@ -66,6 +66,7 @@ class _Parameter(BaseModel):
     std: Annotated[Number, Field(gt=0)]
     lower: Number | None = None
     upper: Number | None = None
+    discrepancy: Annotated[Number, Field(ge=0)] = 0.0
     range: tuple[Number, Number]
 
 
@@ -128,7 +129,7 @@ def _assemble(file: _File, where: str) -> Species:
                 f"[{lower:g}, {upper:g}], got {list(p.range)}"
             )
         try:
-            parameters.append(Parameter(name, unit, p.mean, p.std, lower, upper))
+            parameters.append(Parameter(name, unit, p.mean, p.std, lower, upper, p.discrepancy))
         except SettingError as error:
             raise SpeciesError(f"{where}: {error}") from None
         ranges.append(p.range)
