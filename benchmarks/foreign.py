@@ -152,11 +152,12 @@ def cloud(number: int, on_grid: bool = False) -> tuple[FloatArray, Truth]:
 
 
 class Row(NamedTuple):
-    """What became of a leaf: why it was refused, or its flags; and the traits by name with truth and ends."""
+    """What became of a leaf: why it was refused, or its flags; and the traits by name with truth, ends and quality."""
 
     number: int
     said: str
     traits: dict[str, tuple[float, float, float, float]]  # value, low, high, true; not a number where there is none
+    quality: dict[str, str]
 
 
 def measured(number: int, on_grid: bool) -> Row:
@@ -166,13 +167,14 @@ def measured(number: int, on_grid: bool) -> Row:
             warnings.simplefilter("error")
             result = phytofit.fit(phytofit.from_points(points, "cm"), threads=1)
     except phytofit.PhytofitError as error:
-        return Row(number, f"refused: {error}", {})
+        return Row(number, f"refused: {error}", {}, {})
     ends = {
         t.name: (t.value, -np.inf if t.low is None else t.low, np.inf if t.high is None else t.high, truth[t.name])
         for t in result.traits
         if t.name in TRAITS
     }
-    return Row(number, " | ".join(result.flags), ends)
+    quality = {t.name: t.quality for t in result.traits}
+    return Row(number, ";".join(result.flags), ends, quality)
 
 
 def part(leaves: range, on_grid: bool, each: bool, pool: ProcessPoolExecutor) -> None:
@@ -186,27 +188,22 @@ def part(leaves: range, on_grid: bool, each: bool, pool: ProcessPoolExecutor) ->
                 for name, (v, a, b, t) in row.traits.items()
             )
             print(f"{row.number}  {cells}  {row.said}")
-    print(
-        f"measured {len(fitted)}, refused {len(rows) - len(fitted)}, of those measured {_unflagged(fitted)} unflagged"
-    )
-    print(f"{'':22}{'median error':>14}{'bias':>9}{'half interval':>15}{'95 % holds':>12}{'unflagged':>11}{'open':>6}")
+    print(f"measured {len(fitted)}, refused {len(rows) - len(fitted)}; usable traits are those that are not poor")
+    print(f"{'':22}{'median error':>14}{'bias':>9}{'half interval':>15}{'95 % holds':>12}{'of usable':>11}{'good':>8}")
     for name, relative in TRAITS.items():
         value, low, high, true = np.array([row.traits[name] for row in fitted]).T
         held = (low <= true) & (true <= high)
-        plain = np.array([not row.said for row in fitted])
+        quality = np.array([row.quality[name] for row in fitted])
+        usable = quality != "poor"
         scale = 100.0 / true if relative else np.ones(len(true))
         error, half = (value - true) * scale, 0.5 * (high - low) * scale
         unit = "%  " if relative else "deg"
         print(
             f"{name:22}{np.median(np.abs(error)):10.2f} {unit}{np.median(error):9.2f}{np.median(half):15.2f}"
-            f"{100.0 * held.mean():10.1f} %{100.0 * held[plain].mean() if plain.any() else np.nan:9.1f} %"
-            f"{np.isinf(half).sum():6}",
+            f"{100.0 * held.mean():10.1f} %{100.0 * held[usable].mean() if usable.any() else np.nan:9.1f} %"
+            f"{100.0 * np.mean(quality == 'good'):6.1f} %",
             flush=True,
         )
-
-
-def _unflagged(rows: list[Row]) -> int:
-    return sum(not row.said for row in rows)
 
 
 def main() -> None:
