@@ -18,7 +18,7 @@ def log_evidence(posterior: Posterior, state: State, at: Evaluation, inflation: 
     """Log probability of the cloud, all free entries of theta integrated out; up to a constant of the cloud.
 
     Laplace's approximation of the posterior about `state`, of what of it lies within the bounds, each on its own: the
-    normal distribution's middle is beyond a bound that holds an entry.  Points whose errors depend on each other count
+    normal distribution's middle is beyond a bound that holds an entry, else at the optimum.  Points whose errors depend on each other count
     as `inflation` times fewer.
 
     at : the state evaluated
@@ -32,7 +32,7 @@ def log_evidence(posterior: Posterior, state: State, at: Evaluation, inflation: 
     weighted = scores * count[:, np.newaxis]
     information = scores.T @ weighted + np.diag(precision + LEAST_KNOWN)
     covariance = np.linalg.inv(information)
-    gradient = (theta - mean) * precision - weighted.sum(axis=0)
+    gradient = np.where((theta <= lower) | (theta >= upper), (theta - mean) * precision - weighted.sum(axis=0), 0.0)
     step = covariance @ gradient  # from the normal distribution's middle
     std = np.sqrt(np.diag(covariance))
     inside = log_ndtr((theta - step - lower) / std) + log_ndtr((upper - theta + step) / std)
