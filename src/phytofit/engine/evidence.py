@@ -18,8 +18,8 @@ def log_evidence(posterior: Posterior, state: State, at: Evaluation, inflation: 
     """Log probability of the cloud, all free entries of theta integrated out; up to a constant of the cloud.
 
     Laplace's approximation of the posterior about `state`, of what of it lies within the bounds, each on its own: the
-    normal distribution's middle is beyond a bound that holds an entry, else at the optimum.  Points whose errors depend on each other count
-    as `inflation` times fewer.
+    normal distribution's middle is beyond a bound that holds an entry, else at the optimum.  Points whose errors depend
+    on each other count as `inflation` times fewer.
 
     at : the state evaluated
     """
