@@ -52,7 +52,7 @@ class Sighting:
     expected beyond it; ``along_stem`` cm of the midrib that lie inside the stem, but so near its surface that they may
     as well be outside; ``leaf_points`` number of points on the leaf; ``base`` whether its start, as fitted, lies in
     no void, however large that may be, and the prior of where that is did not count more often; ``elsewhere`` share of
-    all points that are of no organ, and too crowded for outliers: they lie on something else.
+    all points that are of no organ, and too crowded for outliers: they lie on something else, and no label says so.
     """
 
     sections: FloatArray
@@ -97,6 +97,8 @@ def sighting(posterior: Posterior, state: State, at: Evaluation) -> Sighting:
     end = float(across_leaf(posterior, state)[0][on_leaf > 0.5].max(initial=0.0))
     short = float(on_leaf.sum() * (1.0 - place[on_leaf > 0.5].max(initial=0.0)))
     risen = along_stem(posterior, state)
+    labelled = posterior.organ >= 0
+    left_over = (outlier > 0.5) & (labelled | ~labelled.any())  # points that are labelled as nothing may lie anywhere
     void, start = posterior.void, pose[:3, :3] @ leaf.axis[0] + pose[:3, 3]
     return Sighting(
         found / typical,
@@ -109,7 +111,7 @@ def sighting(posterior: Posterior, state: State, at: Evaluation) -> Sighting:
         risen,
         float(on_leaf.sum()),
         bool(posterior.prior.weight.max() == 1.0) and (void is None or bool(void.larger().at(start) < HIDDEN_BASE)),
-        np.count_nonzero(on_something_else(points[outlier > 0.5], posterior.outlier_density)) / len(points),
+        np.count_nonzero(on_something_else(points[left_over], posterior.outlier_density)) / len(points),
     )
 
 

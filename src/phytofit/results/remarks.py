@@ -236,7 +236,7 @@ KINDS = {
         POOR,
         "{share} of the points lie on surfaces that are neither the fitted stem nor the fitted leaf",
         "Cut the other leaves away",
-        "With `--seed-point`: other leaves remain in the cloud.",
+        "With `--seed-point` or labels: other leaves remain, or the fitted one runs beside its own points.",
     ),
     "others_touch": Kind(
         ("leaf_angle", *WIDTHS, "stem_diameter"),

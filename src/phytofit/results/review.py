@@ -65,11 +65,11 @@ def reviewed(result: Fit, *, labelled: bool = False) -> Fit:
             raise NoPhytomerError(NO_STEM.format(seen.stem_points))
         if not result.relative:
             _check_sizes(result)
-        if seen.elsewhere > MUCH_ELSEWHERE:
-            others = remark("other_surfaces", share=_percent(seen.elsewhere))
-            if result.settings.get("seed_point") is None:
-                raise NoPhytomerError(SEVERAL_LEAVES.format(others.text))
-            found.append(others)
+    if seen.elsewhere > MUCH_ELSEWHERE:
+        others = remark("other_surfaces", share=_percent(seen.elsewhere))
+        if not labelled and result.settings.get("seed_point") is None:
+            raise NoPhytomerError(SEVERAL_LEAVES.format(others.text))
+        found.append(others)
     found += [*_of_the_tip(result), *_of_what_was_seen(result, seen), *_of_noise(result), *_of_the_prior(result)]
     return replace(result, observed=(*result.observed, *found))
 
