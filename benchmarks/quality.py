@@ -1,5 +1,4 @@
-"""Whether a trait's quality says how far to trust it: number, error and coverage of those that are good, to be checked,
-and poor.
+"""Whether a trait's quality says how far to trust it: how many traits are good, check or poor, and their errors.
 
     python benchmarks/quality.py [simulated] [foreign] [real] [--phytomers 200] [--leaves 60] [--keep ROWS.csv]
     python benchmarks/quality.py --from ROWS.csv

@@ -48,7 +48,15 @@ NOT_JUDGED = {  # name, or module.name: why
     "posterior.STEP": "numerical precision",
     "posterior.POSE_STEP": "numerical precision",
     "prior.NO_THICKNESS_CM": "numerical precision",
-    "remarks.NEAR_BOUND": "numerical precision",
+    "leaf_end.NODES": "equation",
+    "leaf_end.SHARES": "equation",
+    "leaf_end.STRAY": "numerical precision",
+    "tip.POINTED": "numerical precision",
+    "tip.STRAY": "numerical precision",
+    "review.NEAR_BOUND": "numerical precision",
+    "scoring.NO_DAMPING": "numerical precision",
+    "scoring.LEAST_DAMPING": "numerical precision",
+    "scoring.MOST_DAMPING": "numerical precision",
     "prepare.CANONICAL_DECIMALS": "numerical precision",
     "likelihood.FARTHEST": "numerical precision",
     "likelihood.ROOT_TWO_PI": "equation",
@@ -85,22 +93,27 @@ def numbers() -> Iterator[Number]:
     kernels = {name for path in files for name in re.findall(r"phytofit\.kernels\.(\w+)", path.read_text("utf-8"))}
     for path in files + [SOURCES / "kernels" / f"{name}.py" for name in sorted(kernels)]:
         text = path.read_text(encoding="utf-8")
-        for node in ast.parse(text).body:
-            target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
-            if not isinstance(node, ast.Assign | ast.AnnAssign) or not isinstance(target, ast.Name):
+        for name, value in _assigned(ast.parse(text)):
+            if not name.isupper() or not _is_numeric(value):
                 continue
-            if node.value is None or not target.id.isupper() or not _is_numeric(node.value):
-                continue
-            comment = text.splitlines()[node.lineno - 1].partition("  # ")[2]
-            found = Number(
-                path.relative_to(SOURCES).as_posix(),
-                target.id,
-                ast.get_source_segment(text, node.value) or "",
-                comment,
-                node.value,
-            )
+            comment = text.splitlines()[value.lineno - 1].partition("  # ")[2]
+            written = ast.get_source_segment(text, value) or ""
+            found = Number(path.relative_to(SOURCES).as_posix(), name, written, comment, value)
             if found.key not in NOT_JUDGED:
                 yield found
+
+
+def _assigned(module: ast.Module) -> Iterator[tuple[str, ast.expr]]:
+    """The names that a module gives to values at its head, one by one where a line names several, and the values."""
+    for node in module.body:
+        target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+        value = node.value if isinstance(node, ast.Assign | ast.AnnAssign) else None
+        if isinstance(target, ast.Name) and value is not None:
+            yield target.id, value
+        elif isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+            for name, one in zip(target.elts, value.elts, strict=False):
+                if isinstance(name, ast.Name):
+                    yield name.id, one
 
 
 def _is_numeric(value: ast.expr) -> bool:
@@ -181,7 +194,7 @@ def _fitted(cloud: Any) -> dict[str, Any]:
         warnings.simplefilter("ignore")  # a changed number may divide by nothing
         try:
             result = phytofit.fit(cloud, threads=1)
-        except Exception as error:  # whatever it raises, a changed number is told by it
+        except Exception as error:  # whatever the changed number makes it raise is its effect
             return {"traits": {}, "flags": [], "refused": type(error).__name__}
     ends = {t.name: [t.value, t.high - t.low] for t in result.traits if t.low is not None and t.high is not None}
     traits = {name: [value, 0.5 * width] for name, (value, width) in ends.items()}

@@ -1,5 +1,6 @@
 """The benchmarks run; their yardstick is plain ICP."""
 
+import ast
 import importlib
 import subprocess
 import sys
@@ -323,3 +324,49 @@ def test_the_discrepancy_is_learned_of_errors_beyond_their_intervals():
         off, std = true * random.standard_normal(5), np.abs(change).sum(axis=1) * 0.01
         leaves.append(discrepancy.Leaf(change @ off + std * random.standard_normal(6), std, change))
     np.testing.assert_allclose(discrepancy.learned(leaves), true, rtol=0.25)
+
+
+JUDGED = """NUMBER = 4  # points
+FIRST, SECOND = 0.5, (1, 2)  # both
+WORD = "no number"
+lower = 3
+FOLLOWS: float = 2.0 * NUMBER
+"""
+
+
+def test_every_judged_number_is_found_and_changed_where_it_stands(monkeypatch, tmp_path):
+    """Also one of several on a line; the changed copy runs with the new value, and only that one is new."""
+    sensitivity = load("sensitivity")
+    package = tmp_path / "phytofit"
+    for folder in sensitivity.FOLDERS:
+        (package / folder).mkdir(parents=True)
+    for folder in (package, package / "engine"):
+        (folder / "__init__.py").write_text("")
+    (package / "engine" / "judged.py").write_text(JUDGED)
+    monkeypatch.setattr(sensitivity, "SOURCES", package)
+    found = {number.name: number for number in sensitivity.numbers()}
+    assert {name: number.why for name, number in found.items()} == {
+        "NUMBER": "points",
+        "FIRST": "both",
+        "SECOND": "both",
+        "FOLLOWS": "",
+    }
+    show = ["-c", "from phytofit.engine.judged import *; print(NUMBER, FIRST, SECOND, FOLLOWS)"]
+    for name, factor, shown in (
+        ("NUMBER", 0.5, "2 0.5 (1, 2) 4.0"),
+        ("FIRST", 2.0, "4 1.0 (1, 2) 8.0"),
+        ("SECOND", 2.0, "4 0.5 (2, 4) 8.0"),
+        ("FOLLOWS", 0.5, "4 0.5 (1, 2) 4.0"),
+    ):
+        assert sensitivity.in_copy(found[name], factor, show).stdout.strip() == shown
+
+
+def test_what_is_not_judged_is_there():
+    sensitivity = load("sensitivity")
+    missing = []
+    for key in sensitivity.NOT_JUDGED:
+        module, name = key.split(".")
+        files = list(sensitivity.SOURCES.rglob(f"{module}.py"))
+        if not any(name in dict(sensitivity._assigned(ast.parse(file.read_text("utf-8")))) for file in files):
+            missing.append(key)
+    assert not missing

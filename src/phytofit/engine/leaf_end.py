@@ -30,7 +30,7 @@ N_STEPS, ACROSS, LEAST_SEEN = 60, (-0.6, 0.0, 0.6), 0.02  # along the strip; pla
 STEP = 1e-4  # for derivatives of the tip
 CLEARLY = 2.0  # standard errors
 MISFIT = 0.018  # of the length, by which the model's end is off, of real leaves: benchmarks/leaf_ends.py
-N_BANDS = 8  # of as many expected points each, by which it is told how unevenly they lie
+N_BANDS = 8  # with equal numbers of expected points, in which the evenness of the points is tested
 NOTHING = 1e-12  # of a strip that ends before all its points
 STRAY = 1e-9  # density of points that the strip does not explain, in units of the noise
 

@@ -64,7 +64,7 @@ class Posterior:
         self.organ = np.full(len(points), -1, np.int8) if organ is None else organ
         self.weights = weights
         self.hidden = hidden
-        self.is_part = False  # whether the points were chosen by `hidden`: of those that are left all were seen
+        self.is_part = False  # whether points in hidden parts were left out on purpose; then all others were seen
         self.seen = self._seen_at(self.points)
         self.outlier_density = 1.0 / _volume(self.points)
         self._executor = executor

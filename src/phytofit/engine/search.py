@@ -35,7 +35,7 @@ __all__ = ["estimate"]
 
 FloatArray = NDArray[np.float64]
 COARSE_POINTS = 700  # that decide which start is the best
-SCOUT_ITERATIONS, COARSE_ITERATIONS = 5, 25  # of all starts; then of those that may be the best
+SCOUT_ITERATIONS, COARSE_ITERATIONS = 5, 25  # for each start; then for each that may still be the best
 LEFT_OUT = 0.1  # share of outliers, above which all starts are tried again with few of them
 HELD_OUTLIERS, HELD_ITERATIONS = 0.1, 12  # at most, then, for each point of the leaf
 HOPELESS = 0.3  # nats for each point, by which a start is behind after the first
