@@ -38,6 +38,7 @@ from phytofit.models.organs import frames_along
 SPECIES = phytofit.load_species()
 N_PARAMETERS = 7  # of the simulated phytomers; the others are at their neutral values
 BOUND_SAMPLE = 40_000  # points by which the Cramer-Rao bound is averaged
+NO_OUTLIERS = -9.0  # logit of their share
 FIRST_SEED = 500_000  # not those of accuracy.py
 
 
@@ -105,15 +106,11 @@ def cramer_rao(made: phytofit.SimulatedPhytomer, job: Job) -> np.ndarray:
     species = SPECIES.leading(N_PARAMETERS)
     likelihood = Posterior.of(species, points)
     state = likelihood.start(made.x[:N_PARAMETERS], made.pose, job.noise_cm)
-    theta = state.theta.copy()
     stem, leaf = (organ.area for organ in made.organs)
-    theta[-5:] = [np.log(job.noise_cm), np.log(job.noise_cm), np.log(0.01), np.log(stem / leaf), -9.0]
-    scores = likelihood.evaluate(likelihood.with_theta(state, theta)).scores
-    keep = [
-        *range(N_PARAMETERS),
-        *range(N_PARAMETERS + 1, N_PARAMETERS + 9),
-        N_PARAMETERS + 10,
-    ]
+    noise = np.log(job.noise_cm)
+    true = state.changed(stem_noise=noise, leaf_noise=noise, stem_share=np.log(stem / leaf), outlier_share=NO_OUTLIERS)
+    scores = likelihood.evaluate(true).scores
+    keep = state.layout.mask(*species.space.names, "turn", "shift", "stem_noise", "leaf_noise", "stem_share")
     information = scores[:, keep].T @ scores[:, keep] * (job.n_points / BOUND_SAMPLE)
     return np.sqrt(np.diag(np.linalg.inv(information)))[:N_PARAMETERS]
 

@@ -144,7 +144,16 @@ def slow_plant(tmp_path_factory):
     return [*PHYTOFIT, "fit", str(folder / "leaf.xyz"), "-u", "cm", "--method", "paper", "--generations", "10000"]
 
 
+@pytest.fixture
+def heeding_interrupts():
+    """What runs in the background, as these tests may, ignores an interrupt, and so would what it starts."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize(("number", "code"), SIGNALS)
+@pytest.mark.usefixtures("heeding_interrupts")
 def test_a_signal_ends_it_with_one_line(slow_plant, tmp_path, number, code):
     started = subprocess.Popen([*slow_plant, "--out", str(tmp_path)], stderr=subprocess.PIPE, text=True)
     log = tmp_path / "phytofit.log"

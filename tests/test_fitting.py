@@ -1,6 +1,7 @@
 """A whole fit by the paper's method: recovers what was simulated, turns with the cloud, the same on any threads."""
 
 import dataclasses
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ from scipy.spatial import cKDTree
 import phytofit
 import phytofit.models
 from phytofit import CloudError, NoPhytomerError, SettingError, SpeciesError, Status, UnitError
-from phytofit.start import prepare as preparation
 
 SMALL = {"method": "paper", "n_samples": 120, "n_points": 800, "n_generations": 5, "threads": 2}
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "sodhi2018"
@@ -264,6 +264,7 @@ def test_every_cloud_of_the_paper_in_three_orientations(path):
 
 @pytest.mark.long
 def test_the_stem_of_a_large_cloud_is_looked_for_in_a_part_of_it(monkeypatch):
+    preparation = sys.modules["phytofit.start.prepare"]  # of a function of the same name
     made, sizes, start_poses = phytofit.simulate(n_points=150_000, noise_cm=0.2, seed=3), [], preparation.start_poses
 
     def counted(points, **more):

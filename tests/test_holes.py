@@ -8,7 +8,7 @@ import phytofit
 from own_leaves import OWN_LEAVES
 from phytofit.engine.holes import find_holes
 from phytofit.engine.posterior import Posterior
-from phytofit.engine.visibility import Hidden, cells
+from phytofit.engine.visibility import CELLS, Hidden
 from phytofit.models import LEAF, Organ
 from phytofit.models.organs import frames_along
 
@@ -58,7 +58,7 @@ def test_a_share_that_rises_evenly_is_given_back_in_between_and_stays_beyond_the
     leaf = flat()
     share = np.linspace(0.0, 0.5, 6)[:, np.newaxis] + np.linspace(0.0, 0.4, 9)
     hidden = Hidden(leaf, share)
-    center = cells(leaf.as_population, leaf.segment_lengths[np.newaxis], np.full((1, 6), 2.25))
+    center = CELLS.places(leaf, leaf.segment_lengths, leaf.half_width)[np.newaxis]
     moved = center + 1.1 * leaf.frame[0, :, 0] - 0.2 * leaf.frame[0, :, 1]
     inside = (slice(1, -2), slice(2, -2))
     expected = (share + 0.1 * 1.1 / 3.0 - 0.05 * 0.4)[inside]
@@ -70,7 +70,7 @@ def test_a_share_that_rises_evenly_is_given_back_in_between_and_stays_beyond_the
 
 def test_the_cells_lie_on_the_leaf_from_right_to_left():
     leaf = flat()
-    center = cells(leaf.as_population, leaf.segment_lengths[np.newaxis], np.full((1, 6), 2.25))[0]
+    center = CELLS.places(leaf, leaf.segment_lengths, leaf.half_width)
     assert np.ptp(center[:, :, 2]) == 0.0
     np.testing.assert_allclose(center[0, :, 1], 1.5)
     np.testing.assert_allclose((center[0] - leaf.axis[0]) @ leaf.frame[0, :, 1], np.arange(9) * 0.5 - 2.0)

@@ -3,7 +3,7 @@
 import inspect
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -27,6 +27,7 @@ from phytofit.start.prepare import DITHER_CM, Prepared, dithered, prepare
 __all__ = ["METHODS", "fit", "mean_at"]
 
 FloatArray = NDArray[np.float64]
+T = TypeVar("T")
 Found = TypeVar("Found", Fit, PaperFit)
 N_SEARCHED = 7  # those and the stem above the leaf
 SEARCH = ("n_samples", "n_generations", "elite_fraction", "covariance_noise")
@@ -137,7 +138,8 @@ def _fit(
 ) -> Fit | PaperFit:
     """As :func:`fit`, of settings that were checked: `used`, of which `search` were chosen."""
     one_thread = threadpool_limits(limits=1, user_api="blas")  # more would round sums in another order
-    with one_thread, ThreadPoolExecutor(threads or os.cpu_count() or 1) as executor:
+    workers = threads or os.cpu_count() or 1
+    with one_thread, ThreadPoolExecutor(workers) if workers > 1 else _AtOnce() as executor:
         found = prepare(
             cloud,
             species,
@@ -179,6 +181,15 @@ def _of_the_way(status: Status, found: Prepared) -> Iterator[Remark]:
         yield remark("search_split" if status is Status.SPLIT_ELITE else "not_converged")
     if found.others_touch:
         yield remark("others_touch")
+
+
+class _AtOnce(Executor):
+    """An executor that does all work at once, in the thread that asks for it."""
+
+    def map(
+        self, fn: Callable[..., T], *iterables: Iterable[Any], timeout: float | None = None, chunksize: int = 1
+    ) -> Iterator[T]:
+        return map(fn, *iterables)
 
 
 def fit_paper(

@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 from phytofit.engine.covariance import covariance_of, grown, misfit_of, mixed, of_sensor, shared_by_neighbors
 from phytofit.engine.dependence import Dependence, score_dependence, width_misfit
 from phytofit.engine.leaf_end import Ending, ending
-from phytofit.engine.refine import Optimum, refinement
+from phytofit.engine.refine import Optimum, optimum_of
 from phytofit.engine.sighting import Sighting, sighting
 from phytofit.engine.tip import gain_of_blunt_end
 from phytofit.engine.whole_pieces import of_whole_pieces
@@ -40,6 +40,10 @@ class Choice(NamedTuple):
     blunt: bool
     rival: FloatArray | None
     alternative: Alternative | None = None
+
+    def lead_of(self, other: Optimum) -> float:
+        """Nats by which another optimum has more evidence, points that err alike counted as few for both."""
+        return other.log_evidence(self.dependence.inflation) - self.optimum.log_evidence(self.dependence.inflation)
 
 
 @dataclass(frozen=True)
@@ -138,8 +142,8 @@ def _with_width_of_whole_pieces(
     whole = of_whole_pieces(optimum.posterior, optimum.state)
     if whole is None:
         return optimum.state.x.copy(), covariance, optimum.converged
-    refined = refinement(whole, optimum.state)
-    state = optimum.state.at(refined.theta)
+    refined = optimum_of(whole, optimum.state)
+    state = refined.state
     of_part = score_dependence(whole, state, dependence)
-    own, _ = covariance_of(whole, state, whole.evaluate(state), of_part)
+    own, _ = covariance_of(whole, state, refined.at, of_part)
     return state.x.copy(), grown(covariance, own[:k, :k], whole.prior.free[:k]), optimum.converged and refined.converged

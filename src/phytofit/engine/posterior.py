@@ -1,7 +1,7 @@
 """The log posterior of a phytomer in a cloud: each point of the stem, of the leaf, or an outlier."""
 
 import copy
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
@@ -14,11 +14,11 @@ from scipy.spatial.transform import Rotation
 from phytofit.engine.layout import State
 from phytofit.engine.mixture import Evaluation, Mixture, Side, Strip, Tube
 from phytofit.engine.prior import Prior
-from phytofit.engine.visibility import N_STRIPS, Hidden, cells
-from phytofit.engine.voids import Void, around_stem, facing_share
-from phytofit.kernels.likelihood import CHANGES, segment_changes
+from phytofit.engine.visibility import CELLS, N_STRIPS, Hidden
+from phytofit.engine.voids import N_AROUND, Void, around_stem, facing_share
+from phytofit.kernels.likelihood import CHANGES, seen_area, segment_changes
 from phytofit.models import Organ, Phytomer
-from phytofit.models.surface import side_frames
+from phytofit.models.surface import Patches, side_frames
 from phytofit.parameters import ParameterSpace
 from phytofit.species import Species
 
@@ -27,7 +27,8 @@ __all__ = ["Posterior"]
 FloatArray = NDArray[np.float64]
 FOLD = "leaf_fold"  # the parameter of a blade that is folded along its midrib
 STEP = 1e-4  # of a prior's spread, for the derivatives of the organs
-POSE_STEP = 1e-4  # cm and radians, for those of the area that was seen
+PLACE_STEP, FACING_STEP = 1e-4, 1e-4  # cm, and concentration, for those of the area that was seen
+RING = Patches.of_tube(1, 1)
 
 
 class Posterior:
@@ -186,8 +187,6 @@ class Posterior:
         length, half = _seen(leaf, columns[:, k])
         pose = self.pose_of(state)
         r, t = pose[:3, :3], pose[:3, 3]
-        leaf_area, leaf_area_change = self._leaf_area(leaf, length, half, state, steps)
-        stem_area, stem_area_change = self._stem_area(stem, state, steps)
         # axes of turning, shifts and centre as the model's frame sees them
         about = r.T @ _left_jacobian(state.turn), r.T, r.T @ (state.center + state.shift - t)
 
@@ -201,29 +200,33 @@ class Posterior:
             np.concatenate([stepped, np.arange(len(layout))[layout.mask("turn", "shift")]]) if derivatives else stepped
         )
         places = np.arange(len(layout))
-        radius = 0.5 * (stem.half_width[:, 1:] + stem.half_width[:, :-1])
+        of_stem = changes(stem, stem.frame, stem.segment_lengths, stem.half_width)
+        sides = tuple(
+            Side(r @ frame[0], right, left, changes(leaf, frame, length, half))
+            for frame, right, left in self._sides(leaf)
+        )
+        stem, leaf = stem.row(0), leaf.row(0)
+        stem_area, stem_area_change = self._stem_area(stem, state, pose, of_stem)
+        leaf_area, leaf_area_change = self._leaf_area(leaf, length[0], half[0], pose, sides)
         tube = Tube(
             columns=np.concatenate([moved, places[layout.mask("stem_facing", "stem_noise")]]),
-            origin=stem.axis[0, :-1] @ r.T + t,
-            frame=r @ stem.frame[0],
-            length=stem.segment_lengths[0],
-            radius=radius[0],
+            origin=stem.axis[:-1] @ r.T + t,
+            frame=r @ stem.frame,
+            length=stem.segment_lengths,
+            radius=0.5 * (stem.half_width[1:] + stem.half_width[:-1]),
             area=stem_area,
             facing=state.facing,
             noise=float(state.noise[0]),
-            change=changes(stem, stem.frame, stem.segment_lengths, stem.half_width),
+            change=of_stem,
             area_change=stem_area_change,
-            area_by_facing=np.zeros(2) if self.void is None else self._by_facing(stem, self.void, state),
+            area_by_facing=np.zeros(2) if self.void is None else self._by_facing(stem, self.void, state, pose),
         )
         strip = Strip(
             columns=np.concatenate([moved, places[layout.mask("leaf_noise", "leaf_thickness")]]),
-            origin=leaf.axis[0, :-1] @ r.T + t,
+            origin=leaf.axis[:-1] @ r.T + t,
             length=length[0],
             half=half[0],
-            sides=tuple(
-                Side(r @ frame[0], right, left, changes(leaf, frame, length, half))
-                for frame, right, left in self._sides(leaf)
-            ),
+            sides=sides,
             area=leaf_area,
             noise=state.noise[1:],
             area_change=leaf_area_change,
@@ -242,73 +245,64 @@ class Posterior:
             yield side_frames(leaf, right - left), right, left
 
     def _leaf_area(
-        self, leaf: Organ, length: FloatArray, half: FloatArray, state: State, steps: FloatArray
+        self, leaf: Organ, length: FloatArray, half: FloatArray, pose: FloatArray, sides: Sequence[Side]
     ) -> tuple[float, FloatArray]:
-        """Area of the leaf, as far as it was seen, and the change (c + 6,) of its logarithm by parameters and pose.
+        """Area of one leaf, as far as it was seen, and the change (c,) of its logarithm."""
+        changes = [(side.change, CELLS.right if side.right > side.left else ~CELLS.right) for side in sides]
+        if len(sides) == 1:
+            changes = [(sides[0].change, np.ones(N_STRIPS, bool))]
+        hidden = None if self.hidden is None else self.hidden.around_cells
+        return _log_seen(CELLS, CELLS.scale(leaf), leaf, length, half, hidden, pose, changes)
 
-        The leaf is a population as :func:`segment_changes` takes it, in the model's frame; `steps` are empty where the
-        change is not wanted.
-        """
-        middle = 0.5 * (half[:, 1:] + half[:, :-1])
-        whole = 2.0 * length * middle
-        if self.hidden is None:
-            return _log_change(whole.sum(axis=1), steps)
-        whole = np.repeat(whole[..., np.newaxis] / N_STRIPS, N_STRIPS, axis=2)
-        return self._seen_area(cells(leaf, length, middle), whole, self.hidden.around_cells, state, steps)
+    def _stem_area(self, stem: Organ, state: State, pose: FloatArray, change: FloatArray) -> tuple[float, FloatArray]:
+        """The same of one stem."""
+        patches = around_stem(stem)[0] if self.void else RING
+        scale = patches.scale(stem)
+        if self.void:
+            scale = scale * np.tile(facing_share(state.facing), len(scale) // N_AROUND)
+        hidden = None if self.void is None else self.void.at
+        changes = [(change, np.ones(len(scale), bool))]
+        return _log_seen(patches, scale, stem, stem.segment_lengths, stem.half_width, hidden, pose, changes)
 
-    def _stem_area(self, stem: Organ, state: State, steps: FloatArray) -> tuple[float, FloatArray]:
-        """The same of the stem."""
-        if self.void is None:
-            half = 0.5 * (stem.half_width[:, 1:] + stem.half_width[:, :-1])
-            return _log_change(2.0 * np.pi * np.sum(stem.segment_lengths * half, axis=1), steps)
-        places, area = around_stem(stem)
-        return self._seen_area(places, area * facing_share(state.facing), self.void.at, state, steps)
-
-    def _by_facing(self, stem: Organ, void: Void, state: State) -> FloatArray:
+    def _by_facing(self, stem: Organ, void: Void, state: State, pose: FloatArray) -> FloatArray:
         """Change (2,) of the logarithm of the stem's area, as far as it was seen, by where its points face."""
-        places, area = around_stem(stem.row(0).as_population)
-        pose = self.pose_of(state)
-        seen = (area * (1.0 - void.at(places @ pose[:3, :3].T + pose[:3, 3]))).sum(axis=(0, 1))
-        moves = POSE_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        _, places, area = around_stem(stem)
+        seen = (area * (1.0 - void.at(places @ pose[:3, :3].T + pose[:3, 3]))).reshape(-1, N_AROUND).sum(axis=0)
+        moves = FACING_STEP * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
         log = np.log([float(seen @ facing_share(state.facing + move)) for move in moves])
-        change: FloatArray = (log[::2] - log[1::2]) / (2.0 * POSE_STEP)
+        change: FloatArray = (log[::2] - log[1::2]) / (2.0 * FACING_STEP)
         return change
 
-    def _seen_area(
-        self,
-        places: FloatArray,
-        whole: FloatArray,
-        hidden: Callable[[FloatArray], FloatArray],
-        state: State,
-        steps: FloatArray,
-    ) -> tuple[float, FloatArray]:
-        """What is seen of a population's areas (c, ...) around places (c, ..., 3), in the model's frame, of which a
-        share is `hidden`; and the change (c + 6,) of its logarithm.
 
-        Only the first plant's places are looked at, and a little beside them: how the others change what is seen
-        follows from the slope of `hidden` there.
-        """
-        pose = self.pose_of(state)
-        r = pose[:3, :3]
-        there = places[0] @ r.T + pose[:3, 3]
-        seen = 1.0 - hidden(there[np.newaxis])[0]
-        area = float(np.sum(whole[0] * seen))
-        n = len(steps)
-        if not n:
-            return area, np.zeros(0)
-        beside = POSE_STEP * np.concatenate([np.eye(3), -np.eye(3)]).reshape(6, *[1] * (there.ndim - 1), 3)
-        high, low = hidden(there + beside).reshape(2, 3, *seen.shape)
-        lost = whole[0] * (high - low) / (2.0 * POSE_STEP)  # (3, ...) by a move along each axis of the cloud's frame
-        rest = tuple(range(1, whole.ndim))
-        twice = 2.0 * steps.reshape(-1, *[1] * (whole.ndim - 1))
-        larger = np.sum((whole[1 : n + 1] - whole[n + 1 :]) / twice * seen, axis=rest)
-        moved = (places[1 : n + 1] - places[n + 1 :]) / twice[..., np.newaxis]
-        in_frame = np.tensordot(r, lost, axes=(0, 0))  # by a move along each axis of the model's
-        by_parameters = larger - moved.reshape(n, -1) @ np.moveaxis(in_frame, 0, -1).ravel()
-        arm = there - state.center - state.shift
-        turned = [np.sum(np.moveaxis(np.cross(axis, arm), -1, 0) * lost) for axis in _left_jacobian(state.turn).T]
-        by_pose = -np.array([*turned, *lost.reshape(3, -1).sum(axis=1)])
-        return area, np.concatenate([by_parameters, by_pose]) / area
+def _log_seen(
+    patches: Patches,
+    scale: FloatArray,
+    organ: Organ,
+    length: FloatArray,
+    half: FloatArray,
+    hidden: Callable[[FloatArray], FloatArray] | None,
+    pose: FloatArray,
+    changes: Sequence[tuple[FloatArray, NDArray[np.bool_]]],
+) -> tuple[float, FloatArray]:
+    """Area of an organ in the model's frame, as far as it was seen, and the change (c,) of its logarithm.
+
+    `hidden` says which share is not seen of what lies at places (n, m, p, 3) of the cloud; `changes` are those of the
+    segments (m, 9, c), each with the patches (p,) that change so.
+    """
+    shape = len(length), len(scale)
+    seen, slope = np.ones(shape), np.zeros((*shape, 3))
+    if hidden is not None:
+        places = patches.places(organ, length, half) @ pose[:3, :3].T + pose[:3, 3]
+        beside = PLACE_STEP * np.moveaxis(pose[:3, :3] @ patches.frames(organ), -1, 0)
+        at, high, low = np.split(hidden(np.concatenate([places[np.newaxis], places + beside, places - beside])), [1, 4])
+        seen, slope = 1.0 - at[0], np.moveaxis(low - high, 0, -1) / (2.0 * PLACE_STEP)
+    area, total = 0.0, np.zeros(changes[0][0].shape[2])
+    for change, those in changes:
+        area += seen_area(
+            patches.along[those], patches.across[those], scale[those], seen[:, those], slope[:, those],
+            length, half, change, total,
+        )  # fmt: skip
+    return area, total / area
 
 
 def _volume(points: FloatArray) -> float:
@@ -328,21 +322,6 @@ def _seen(leaf: Organ, share: FloatArray) -> tuple[FloatArray, FloatArray]:
     half = leaf.half_width.copy()
     half[:, 1:] = leaf.half_width[:, :-1] + part * np.diff(leaf.half_width, axis=1)
     return leaf.segment_lengths * part, half
-
-
-def _log_change(area: FloatArray, steps: FloatArray) -> tuple[float, FloatArray]:
-    """The first of areas (c,) of a population as :func:`segment_changes` takes it, and the change (c + 6,) of its
-    logarithm, which the pose does not change; (0,) without steps."""
-    if not len(steps):
-        return float(area[0]), np.zeros(0)
-    return float(area[0]), np.append(_slope(np.log(area), steps), np.zeros(6))
-
-
-def _slope(values: FloatArray, steps: FloatArray) -> FloatArray:
-    """Change (k,) of values (2 k + 1,) of a population as :func:`segment_changes` takes it, per unit."""
-    high, low = values[1:].reshape(2, len(steps))
-    slope: FloatArray = (high - low) / (2.0 * steps)
-    return slope
 
 
 def _left_jacobian(turn: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ __all__ = [
     "Cloud",
     "Optimum",
     "optimum_near",
+    "optimum_of",
     "refinement",
     "terms",
 ]
@@ -106,13 +107,12 @@ def optimum_near(
         if number == 0 and len(cloud.points) >= 2 * FEW_POINTS:
             few = cloud.part(FEW_POINTS).posterior(species, thick=thick, cut=cut, hidden=hidden)
             state = state.at(refinement(few, state, tolerance=COARSE_TOLERANCE).theta)
-        end = refinement(posterior, state, tolerance=tolerance)
-        state = state.at(end.theta)
-        at = posterior.evaluate(state)
-        hidden = find_holes(posterior, state, at, with_void=with_void)
+        optimum = optimum_of(posterior, state, tolerance=tolerance)
+        state = optimum.state
+        hidden = find_holes(posterior, state, optimum.at, with_void=with_void)
         if _alike(hidden, posterior.hidden):
             break
-    return Optimum(posterior, state, at, end.converged)
+    return optimum
 
 
 def _alike(one: Hidden | None, other: Hidden | None) -> bool:
@@ -124,6 +124,13 @@ def _alike(one: Hidden | None, other: Hidden | None) -> bool:
         apart = float(np.linalg.norm(one.void.center - other.void.center))
         same = max(apart, abs(one.void.radius - other.void.radius)) <= SAME_SHARE * one.void.radius
     return same and bool(np.abs(one.share - other.share).max() <= SAME_SHARE)
+
+
+def optimum_of(posterior: Posterior, state: State, **limits: Any) -> Optimum:
+    """Where the state leads to under this posterior, holes and all."""
+    end = refinement(posterior, state, **limits)
+    there = state.at(end.theta)
+    return Optimum(posterior, there, posterior.evaluate(there), end.converged)
 
 
 def refinement(posterior: Posterior, state: State, **limits: Any) -> Refined:

@@ -22,6 +22,7 @@ from phytofit.engine.refine import (
     Cloud,
     Optimum,
     optimum_near,
+    optimum_of,
     refinement,
     terms,
 )
@@ -73,18 +74,18 @@ def estimate(
     cloud = Cloud(points, organ, executor)
     state = _drawn_in(plain, cloud, starts)
     chosen = _one_sided(_choice(_candidates(plain, species, cloud, state)))
-    return outcome(_at_surface(species, _with_hidden_base(chosen)))
+    return outcome(_at_surface(_with_hidden_base(chosen)))
 
 
-def _drawn_in(plain: Species, cloud: Cloud, begun: Sequence[tuple[FloatArray, FloatArray]]) -> State:
-    """The best of what the beginnings (parameters and pose) lead to, with a part of the points and wide noise.
+def _drawn_in(plain: Species, cloud: Cloud, starts: Sequence[tuple[FloatArray, FloatArray]]) -> State:
+    """The best of what the starts (parameters and pose) lead to, with a part of the points and wide noise.
 
     Where that leaves many points out, as beyond a hole, they are gone through again with wide noise and few outliers.
     """
     part = cloud._replace(executor=None).part(COARSE_POINTS)  # one thread a start
     coarse = part.posterior(plain)
     noise_cm = START_NOISE * float(plain.space.mean[plain.space.index("leaf_length")])
-    states = [coarse.start(mean, pose, noise_cm) for mean, pose in begun]
+    states = [coarse.start(mean, pose, noise_cm) for mean, pose in starts]
     run = map if cloud.executor is None else cloud.executor.map
 
     least = np.log(0.5 * noise_cm)
@@ -107,11 +108,11 @@ def _drawn_in(plain: Species, cloud: Cloud, begun: Sequence[tuple[FloatArray, Fl
 
 
 def _candidates(plain: Species, species: Species, cloud: Cloud, state: State) -> list[Optimum]:
-    """Refined: the paper's model, the same with its tip missing, and, if they promise enough, the two with all
+    """Refined: the paper's model, the same with its tip missing, and, if they may gain enough, the two with all
     parameters of the species."""
     found = [optimum_near(plain, state, cloud, with_void=True)]
     hidden = found[0].posterior.hidden
-    found.append(optimum_near(plain, _cut(found[0].state), cloud, cut=True, hidden=hidden))
+    found.append(_with_tip_missing(plain, cloud, found[0], CUT_SHARES[:1], thick=False))
     if len(plain.space) == len(species.space):
         return found
     simple = found[1] if found[1].log_likelihood - found[0].log_likelihood > TIP_MISSING else found[0]
@@ -141,26 +142,37 @@ def _rich(species: Species, cloud: Cloud, simple: Optimum) -> tuple[Optimum, Opt
     starts = [extended, *turned_blade(Optimum(richer, extended, richer.evaluate(extended), converged=False))]
     coarse = partial(optimum_near, species, thick=True, tolerance=COARSE_TOLERANCE)
     best = max((coarse(it, part, hidden=known) for it in starts), key=_log_likelihood)
-    best = _restarted(species, part, best, LOWER_ROUNDS)
-    best = coarse(best.state, cloud, hidden=best.posterior.hidden, with_void=True)
-    best = _restarted(species, cloud, best, 1)
-    best = optimum_near(species, best.state, cloud, thick=True, hidden=best.posterior.hidden)
-    hidden = best.posterior.hidden
-    starts = [_cut(best.state, share) for share in CUT_SHARES]
-    cut = max((coarse(it, part, cut=True, hidden=hidden) for it in starts), key=_log_likelihood)
-    return best, optimum_near(species, cut.state, cloud, thick=True, cut=True, hidden=cut.posterior.hidden)
+    best = _restarted(species, part, best)
+    best = optimum_near(species, best.state, cloud, thick=True, hidden=best.posterior.hidden, with_void=True)
+    return best, _with_tip_missing(species, cloud, best, CUT_SHARES, thick=True)
+
+
+def _with_tip_missing(
+    species: Species, cloud: Cloud, whole: Optimum, shares: Sequence[float], *, thick: bool
+) -> Optimum:
+    """The optimum near a whole one, of a leaf whose tip is missing, from the best of so many shares of its midrib; as a
+    part of the points has it, where that has no use for it."""
+    hidden, part = whole.posterior.hidden, cloud.part(FEW_POINTS)
+    coarse = partial(optimum_near, species, thick=thick, cut=True, tolerance=COARSE_TOLERANCE, hidden=hidden)
+    cut = max((coarse(_cut(whole.state, share), part) for share in shares), key=_log_likelihood)
+    posterior = part.posterior(species, thick=thick, hidden=hidden)
+    of_whole = Optimum(posterior, whole.state, posterior.evaluate(whole.state, derivatives=False), converged=False)
+    if cut.log_likelihood - of_whole.log_likelihood > TIP_DOUBTFUL:
+        return optimum_near(species, cut.state, cloud, thick=thick, cut=True, hidden=cut.posterior.hidden)
+    posterior = cloud.posterior(species, thick=thick, cut=True, hidden=hidden)
+    return Optimum(posterior, cut.state, posterior.evaluate(cut.state), converged=False)
 
 
 def _log_likelihood(optimum: Optimum) -> float:
     return optimum.log_likelihood
 
 
-def _restarted(species: Species, cloud: Cloud, best: Optimum, rounds: int) -> Optimum:
+def _restarted(species: Species, cloud: Cloud, best: Optimum) -> Optimum:
     """The best optimum so far, or that of a restart which fits better: with a turned blade, more leaf or stem, a
-    midrib along the points, or, so many times in a row, an insertion lower down."""
+    midrib along the points, or, some times in a row, an insertion lower down."""
     for restart in (turned_blade, longer_leaf, longer_stem, along_points):
         best = _better(species, cloud, best, restart)
-    for _ in range(rounds):
+    for _ in range(LOWER_ROUNDS):
         lower = _better(species, cloud, best, lower_insertion)
         if lower is best:
             break
@@ -214,17 +226,11 @@ def _choice(found: Sequence[Optimum]) -> Choice:
 
 def _one_sided(chosen: Choice) -> Choice:
     """Of a stem that was seen from one side, the fit that knows it, where it has more evidence."""
-    one_sided = chosen.optimum.posterior
-    free = one_sided.under(one_sided.prior.one_sided())
-    refined = refinement(free, chosen.optimum.state)
-    there = chosen.optimum.state.at(refined.theta)
-    if np.linalg.norm(there.facing) < LEAST_FACING:
+    posterior = chosen.optimum.posterior
+    optimum = optimum_of(posterior.under(posterior.prior.one_sided()), chosen.optimum.state)
+    if np.linalg.norm(optimum.state.facing) < LEAST_FACING or chosen.lead_of(optimum) < 0.0:
         return chosen
-    optimum = Optimum(free, there, free.evaluate(there), refined.converged)
-    lead = optimum.log_evidence(chosen.dependence.inflation) - chosen.optimum.log_evidence(chosen.dependence.inflation)
-    if lead < 0.0:
-        return chosen
-    return chosen._replace(optimum=optimum, dependence=score_dependence(free, there))
+    return chosen._replace(optimum=optimum, dependence=score_dependence(optimum.posterior, optimum.state))
 
 
 def _with_hidden_base(chosen: Choice) -> Choice:
@@ -236,15 +242,11 @@ def _with_hidden_base(chosen: Choice) -> Choice:
     if sighting(optimum.posterior, optimum.state, optimum.at).shows_base:
         return chosen
     careful = optimum.posterior.under(optimum.posterior.prior.weighted(optimum.state.layout.mask(*OF_START), inflation))
-    refined = refinement(careful, optimum.state)
-    there = optimum.state.at(refined.theta)
-    return chosen._replace(
-        optimum=Optimum(careful, there, careful.evaluate(there), refined.converged),
-        dependence=score_dependence(careful, there, chosen.dependence),
-    )
+    optimum = optimum_of(careful, optimum.state)
+    return chosen._replace(optimum=optimum, dependence=score_dependence(careful, optimum.state, chosen.dependence))
 
 
-def _at_surface(species: Species, chosen: Choice) -> Choice:
+def _at_surface(chosen: Choice) -> Choice:
     """Of a leaf that rises along its stem, a little inside it, the one that starts at its surface, if that is the more
     probable: there leaves grow, and a cloud hardly tells."""
     free, state = chosen.optimum.posterior, chosen.optimum.state
@@ -252,15 +254,13 @@ def _at_surface(species: Species, chosen: Choice) -> Choice:
         return chosen
     at_surface = state.changed(**{OFFSET: 1.0})
     held = free.under(free.prior.fixing(at_surface.theta, state.layout.mask(OFFSET)))
-    refined = refinement(held, at_surface)
-    there = state.at(refined.theta)
-    optimum = Optimum(held, there, held.evaluate(there), refined.converged)
-    lead = optimum.log_evidence(chosen.dependence.inflation) - chosen.optimum.log_evidence(chosen.dependence.inflation)
+    optimum = optimum_of(held, at_surface)
+    lead = chosen.lead_of(optimum)
     if lead < 0.0:
         return chosen
     return chosen._replace(
         optimum=optimum,
-        dependence=score_dependence(held, there, chosen.dependence),
+        dependence=score_dependence(held, optimum.state, chosen.dependence),
         alternative=Alternative(chosen.optimum, chosen.dependence, float(expit(-lead))),
     )
 

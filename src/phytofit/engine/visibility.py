@@ -9,12 +9,13 @@ from scipy.ndimage import map_coordinates, maximum_filter, minimum_filter
 
 from phytofit.engine.voids import PARTS, Void
 from phytofit.models import Organ
-from phytofit.models.surface import on_strip, side_frames
+from phytofit.models.surface import Patches, on_strip
 
-__all__ = ["N_STRIPS", "Hidden", "cells"]
+__all__ = ["CELLS", "N_STRIPS", "Hidden"]
 
 FloatArray = NDArray[np.float64]
 N_STRIPS = 9  # of a leaf, along it
+CELLS = Patches.of_strip(1, N_STRIPS)  # of each piece of a leaf
 IN_VOID = 0.1  # share not seen, from which a cell lies in a void
 
 
@@ -48,18 +49,12 @@ class Hidden:
     @cached_property
     def _centers(self) -> FloatArray:
         """(m, 9, 3) of the cells."""
-        leaf = self.leaf
-        lengths, middle = leaf.segment_lengths[np.newaxis], self._middle[np.newaxis]
-        centers: FloatArray = cells(leaf.as_population, lengths, middle)[0]
-        return centers
+        return CELLS.places(self.leaf, self.leaf.segment_lengths, self.leaf.half_width)
 
     @cached_property
     def _lateral(self) -> FloatArray:
         """(m, 9, 3) directions across the blade in the cells."""
-        right, left = (side_frames(self.leaf, side)[:, :, 1] for side in (1.0, -1.0))
-        of_strip = np.arange(N_STRIPS) >= N_STRIPS // 2
-        lateral: FloatArray = np.where(of_strip[:, np.newaxis], right[:, np.newaxis], left[:, np.newaxis])
-        return lateral
+        return CELLS.frames(self.leaf)[..., 1]
 
     @cached_property
     def _long(self) -> FloatArray:
@@ -116,15 +111,3 @@ class Hidden:
         at = np.stack([along, across])
         found: FloatArray = map_coordinates(self.share, at, order=3, prefilter=False, mode="nearest")
         return found
-
-
-def cells(leaf: Organ, length: FloatArray, middle: FloatArray) -> FloatArray:
-    """Centres (n, m, 9, 3) of the cells of a population's leaves: lengths and half widths in the middle (n, m) of the
-    pieces."""
-    place = (2.0 * np.arange(N_STRIPS) + 1.0) / N_STRIPS - 1.0
-    across = middle[..., np.newaxis] * place
-    along = leaf.axis[:, :-1] + 0.5 * length[..., np.newaxis] * leaf.frame[..., 0]
-    right, left = (side_frames(leaf, side)[:, :, np.newaxis, :, 1] for side in (1.0, -1.0))
-    lateral = np.where(place[:, np.newaxis] >= 0.0, right, left)
-    centers: FloatArray = along[:, :, np.newaxis] + across[..., np.newaxis] * lateral
-    return centers

@@ -9,16 +9,16 @@ from scipy.spatial.distance import cdist
 from scipy.special import ndtr
 
 from phytofit.models import Organ
-from phytofit.models.surface import places_on_strip
+from phytofit.models.surface import Patches, places_on_strip
 
-__all__ = ["PARTS", "Void", "around_stem", "facing_share", "find_void"]
+__all__ = ["N_AROUND", "PARTS", "Void", "around_stem", "facing_share", "find_void"]
 
 FloatArray = NDArray[np.float64]
 PARTS = 3  # of a piece of the leaf, along it, in which a void is sampled
 MOST = 0.98  # of what is in a void is not seen: some of an organ always is
 SPREAD = 0.25  # of its radius, by which a void may be smaller or larger
 REACH_CM, STEP_CM = 4.0, 0.25  # from the leaf's base, so far is looked; between places on the organs' surfaces
-N_ALONG, N_AROUND, N_ACROSS = 80, 12, 9  # places along the stem, around it, across the leaf
+N_ALONG, N_AROUND, N_ACROSS = 80, 12, 9  # places along the stem, or more, around it, across the leaf
 GRIDS = ((3.0, 7), (0.75, 4))  # cm to either side, places: of the balls' centres, then around the best of them
 STRAY = 2  # points that a ball without points may hold
 MISSING = 16.0  # points of the stem that are expected in it
@@ -59,11 +59,11 @@ def find_void(
     those = points[np.linalg.norm(points - base, axis=1) < near]
     if len(those) <= STRAY or not on_stem.any():
         return None
-    places, area = around_stem(stem.as_population)
+    _, places, area = around_stem(stem)
     from_axis = (points[on_stem] - stem.axis[0]) @ stem.frame[0, :, 1:]
     angle = np.arctan2(from_axis[:, 1], from_axis[:, 0]) / (2.0 * np.pi) * N_AROUND
     sector = np.bincount(np.round(angle).astype(int) % N_AROUND, minlength=N_AROUND)
-    of_stem = area * N_AROUND * sector / area.sum()
+    of_stem = area * np.tile(N_AROUND * sector, area.shape[1] // N_AROUND) / area.sum()
     close = np.linalg.norm(places - base, axis=-1) < near
     stem_places, of_stem = places[close], of_stem[close]
     leaf_places, of_leaf = _across_leaf(leaf)
@@ -86,25 +86,15 @@ def find_void(
     return Void(center, radius, float(np.hypot(noise_cm, 0.5 * max(steps))))
 
 
-def around_stem(stem: Organ) -> tuple[FloatArray, FloatArray]:
-    """Places (c, 80, 12, 3) on the stems of a population, the first on the side of its frame's second column, and the
-    area (c, 80, 12) around each."""
-    long = stem.segment_lengths
-    before = np.concatenate([np.zeros((len(long), 1)), np.cumsum(long, axis=1)], axis=1)
-    share = (np.arange(N_ALONG) + 0.5) / N_ALONG
-    z = before[:, -1:] * share
-    radius = np.stack([np.interp(*row) for row in zip(z, before, stem.half_width, strict=True)])
-    tangent, across = stem.frame[:, 0, :, 0], stem.frame[:, 0, :, 1:]
-    angle = 2.0 * np.pi * np.arange(N_AROUND) / N_AROUND
-    ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ across.transpose(0, 2, 1)
-    middle = stem.axis[:, :1] + z[..., np.newaxis] * tangent[:, np.newaxis]
-    places = middle[:, :, np.newaxis] + radius[..., np.newaxis, np.newaxis] * ring[:, np.newaxis]
-    area = 2.0 * np.pi / N_AROUND * radius * before[:, -1:] / N_ALONG
-    return places, np.repeat(area[..., np.newaxis], N_AROUND, axis=2)
+def around_stem(stem: Organ) -> tuple[Patches, FloatArray, FloatArray]:
+    """Patches of a stem, twelve around it, and their places (m, p, 3) and areas (m, p)."""
+    length, half = stem.segment_lengths, stem.half_width
+    patches = Patches.of_tube(-(-N_ALONG // len(length)), N_AROUND)
+    return patches, patches.places(stem, length, half), np.outer(length * (half[1:] + half[:-1]), patches.scale(stem))
 
 
 def facing_share(facing: FloatArray) -> FloatArray:
-    """Density (12,) of points at the places around a stem, beside that of a stem seen from all sides: von Mises, with
+    """Density (12,) of points around a stem, beside that of a stem seen from all sides: von Mises, with
     the concentration `facing` (2,) towards a side."""
     angle = 2.0 * np.pi * np.arange(N_AROUND) / N_AROUND
     density = np.exp(np.cos(angle) * facing[0] + np.sin(angle) * facing[1])

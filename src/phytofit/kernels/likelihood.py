@@ -4,7 +4,7 @@ import numpy as np
 
 from phytofit.kernels.compiling import kernel
 
-__all__ = ["CHANGES", "add_scores", "segment_changes", "strip_density", "tube_density"]
+__all__ = ["CHANGES", "add_scores", "seen_area", "segment_changes", "strip_density", "tube_density"]
 
 REACH = 5.5  # noise levels from a surface at which its density counts as none: e^-15 of the greatest
 CHANGES = 9  # of a segment: translation (3), rotation (3), length, half widths (a stem's radii) at both ends
@@ -328,3 +328,41 @@ def segment_changes(axis, frame, length, half, steps, turning, shifting, center,
                 change[j, 3 + a, k + 3 + t] = 0.0
         for a in range(6, 9):
             change[j, a, k:] = 0.0
+
+
+@kernel
+def seen_area(along, across, scale, seen, slope, length, half, change, total):
+    """Area of an organ, as far as it was seen, and its change per unit of the parameters that change its segments.
+
+    Parameters
+    ----------
+    along (p,), across (p, 2) : the same patches of each segment: where their middles lie along it, a share of its
+        length, and across and off it, shares of its half width (or radius) in its middle
+    scale (p,) : area of each, as a share of the segment's length times the sum of its half widths
+    seen (m, p), slope (m, p, 3) : share of each that was seen, and the change of that by moves along the columns of its
+        segment's frame
+    length (m,), half (m + 1,) : the segments
+    change (m, 9, k) : of the segments, as of :func:`segment_changes`
+    total : (k,), to which the changes are added
+    """
+    whole = 0.0
+    for j in range(len(length)):
+        long, wide = length[j], half[j] + half[j + 1]
+        shift = change[j]
+        for i in range(len(along)):
+            area, share = scale[i] * long * wide, seen[j, i]
+            whole += area * share
+            right, up = across[i, 0], across[i, 1]
+            u, v, w = along[i] * long, 0.5 * right * wide, 0.5 * up * wide
+            by_u, by_v, by_w = area * slope[j, i, 0], area * slope[j, i, 1], area * slope[j, i, 2]
+            by_length = scale[i] * wide * share + by_u * along[i]
+            by_wide = scale[i] * long * share + 0.5 * (by_v * right + by_w * up)
+            for c in range(change.shape[2]):
+                total[c] += (
+                    by_length * shift[6, c]
+                    + by_wide * (shift[7, c] + shift[8, c])
+                    + by_u * (shift[0, c] + shift[4, c] * w - shift[5, c] * v)
+                    + by_v * (shift[1, c] + shift[5, c] * u - shift[3, c] * w)
+                    + by_w * (shift[2, c] + shift[3, c] * v - shift[4, c] * u)
+                )
+    return whole
