@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import phytofit
-from phytofit.engine.covariance import covariance_of, misfit_of, mixed
+from phytofit.engine.covariance import covariance_of, misfit_of
 from phytofit.engine.dependence import NONE, Dependence, GaussianCorrelation, score_dependence
 from phytofit.engine.posterior import Posterior
 from phytofit.engine.refine import refinement
@@ -20,20 +20,6 @@ SURER = 300.0  # times, a prior that says as much as so small a cloud
 
 def dependence(stem, leaf):
     return Dependence(np.eye(2), 1.0, 100.0, stem, leaf)
-
-
-def test_the_error_where_one_of_two_models_is_right():
-    """Mean squares of errors that are drawn: the truth is about one estimate or, three times in ten, the other."""
-    random = np.random.default_rng(0)
-    a, b, apart = np.array([[1.0, 0.3], [0.3, 0.5]]), np.array([[0.2, 0.0], [0.0, 2.0]]), np.array([1.5, -0.5])
-    n = 200_000
-    there = random.random(n) < 0.3
-    truth = np.where(
-        there[:, np.newaxis],
-        apart + random.multivariate_normal([0, 0], b, n),
-        random.multivariate_normal([0, 0], a, n),
-    )
-    np.testing.assert_allclose(mixed(a, b, apart, 0.3), truth.T @ truth / n, atol=0.02)
 
 
 def test_errors_that_stem_and_leaf_share_are_no_misfit_of_the_blade():

@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 import phytofit
 from phytofit.engine.dependence import NONE, width_misfit
-from phytofit.engine.intervals import covariance_of_independent, propagated
+from phytofit.engine.intervals import Ends, covariance_of_independent, propagated
 from phytofit.engine.posterior import Posterior
 from phytofit.parameters import ParameterSpace
 
@@ -167,3 +167,22 @@ def test_intervals_of_traits_know_the_discrepancy_of_real_organs_and_those_of_pa
 def _half(result, name):
     trait = next(t for t in result.traits if t.name == name)
     return 0.5 * (trait.high - trait.low)
+
+
+def test_the_interval_where_one_of_two_estimates_is_right():
+    """Mean squares of errors that are drawn: the truth is about one estimate or, three times in ten, the other."""
+    random = np.random.default_rng(0)
+    n, quantile = 400_000, 1.96
+    apart = np.array([1.5, -0.5, 0.0])
+    here, there = np.array([1.0, 0.7, 0.2]), np.array([0.4, 1.4, 0.1])
+    other = random.random((n, 1)) < 0.3
+    truth = np.where(other, apart + there * random.normal(size=(n, 3)), here * random.normal(size=(n, 3)))
+    mixed = Ends(quantile * here, quantile * here).mixed(
+        [(0.3, apart, Ends(quantile * there, quantile * there))], quantile
+    )
+    # the two sides together are as far as the root mean square: what lies to one side widens that side alone
+    square = (mixed.below**2 + mixed.above**2 - (quantile**2 * (0.7 * here**2 + 0.3 * there**2))) / quantile**2
+    np.testing.assert_allclose(square, np.mean(truth**2, axis=0), rtol=0.01)
+    assert mixed.above[0] > mixed.below[0]
+    assert mixed.below[1] > mixed.above[1]
+    assert mixed.below[2] == mixed.above[2]

@@ -15,6 +15,7 @@ import phytofit.models
 import phytofit.parameters
 import phytofit.simulation
 from phytofit import Status
+from phytofit.engine.outcome import Alternative
 from phytofit.results import beside_its_rival
 
 DATA = Path(__file__).parents[1] / ".." / "shared" / "data" / "sodhi2018"
@@ -300,21 +301,38 @@ def test_every_cloud_of_the_paper_in_three_orientations(path):
         assert values(phytofit.fit(turned))["leaf_length"] == pytest.approx(values(given)["leaf_length"], abs=2.0)
 
 
-def test_two_solutions_are_told(result):
-    """Where another model is about as probable, and its traits lie beyond the intervals; not where they lie within."""
-    assert result.estimate.rival is None
+def beside(result, length_cm, probability):
+    """The result, where with some probability its leaf is so much longer."""
     longer = result.x.copy()
-    longer[3] += 10.0
+    longer[3] += length_cm
+    other = Alternative(probability, result.species.space, longer, result.trait_covariance)
+    return replace(result, estimate=replace(result.estimate, alternatives=(other,)))
 
-    def beside(rival):
-        return beside_its_rival(replace(result, estimate=replace(result.estimate, rival=rival))).remarks
 
-    (one,) = beside(longer)
+def test_two_solutions_are_told(result):
+    """Where another estimate is about as probable, and its traits lie beyond the intervals; not where they lie
+    within, or hardly may be."""
+    assert result.estimate.alternatives == ()
+    (one,) = (it for it in beside_its_rival(beside(result, 10.0, 0.4)).remarks if it.code == "two_fits")
     assert one.text.startswith("two fits are about equally probable: leaf_length may be ")
     assert float(one.text.split()[9]) == pytest.approx(values(result)["leaf_length"] + 10.0, abs=0.5)
     assert "leaf_length" in one.traits
     assert "stem_diameter" not in one.traits
-    assert beside(result.x) == beside(None) == ()
+    assert "two_fits" not in beside_its_rival(beside(result, 10.0, 0.05)).flags
+    assert beside_its_rival(beside(result, 0.0, 0.4)).remarks == beside_its_rival(result).remarks == ()
+
+
+@pytest.mark.parametrize("probability", [0.01, 0.3, 0.5])
+def test_intervals_reach_as_far_as_two_estimates_differ(result, probability):
+    """In the root mean square, to the side where the other lies; other traits hardly change."""
+    both = beside(result, 10.0, probability)
+    alone, mixed = ({t.name: t for t in it.traits} for it in (result, both))
+    above = mixed["leaf_length"].high - mixed["leaf_length"].value
+    assert above > result.estimate.quantile * 10.0 * np.sqrt(probability)
+    assert mixed["leaf_length"].low == pytest.approx(alone["leaf_length"].low, abs=0.5)
+    assert mixed["stem_diameter"].high == pytest.approx(alone["stem_diameter"].high, rel=1e-3)
+    low, high = both.parameter_intervals["leaf_length"]
+    assert high - both.parameters["leaf_length"] > both.parameters["leaf_length"] - low
 
 
 def test_the_same_bytes_however_many_threads_blas_may_use(tmp_path):

@@ -408,7 +408,7 @@ def wavy_ends():
     plain = SPECIES.leading(7)
     upright = np.array([1.2, 15.0, 30.0, 60.0, 5.0, 3.0, 10.0])
     start = Posterior.of(plain, points).start(upright, np.eye(4), 2.0)
-    return points, posterior._candidates(plain, SPECIES, Cloud(points, None, None), start)
+    return points, posterior._hypotheses(plain, SPECIES, Cloud(points, None, None), start)
 
 
 @pytest.mark.parametrize("on_stem", [0.0, 0.6])
@@ -417,7 +417,7 @@ def test_misfit_does_not_speak_for_the_poorer_model(on_stem, monkeypatch, wavy_e
     that fits a little better is not believed.  Where the stem's are not, the leaf's are misfit, of which the richer
     leaf has less."""
     points, ends = wavy_ends
-    gain = ends[2].log_likelihood - ends[0].log_likelihood
+    gain = ends[1].whole.log_likelihood - ends[0].whole.log_likelihood
     assert gain > 300.0
 
     def inflated(likelihood, state, known=None):
@@ -430,7 +430,8 @@ def test_misfit_does_not_speak_for_the_poorer_model(on_stem, monkeypatch, wavy_e
         return Dependence(np.eye(len(state.theta)), inflation, len(points) / inflation, *bells)
 
     monkeypatch.setattr(posterior, "score_dependence", inflated)
-    assert len(posterior._choice(ends).optimum.state.x) == (7 if on_stem else len(NAMES))
+    rich = ends[1]._replace(dependence=inflated(None, ends[1].whole.state))
+    assert len(posterior._choice([ends[0], rich]).optimum.state.x) == (7 if on_stem else len(NAMES))
 
 
 def test_a_leaf_that_lies_off_its_model_may_start_further_down():

@@ -10,7 +10,7 @@ from phytofit.engine.layout import State
 from phytofit.engine.mixture import Evaluation
 from phytofit.engine.posterior import Posterior
 
-__all__ = ["covariance_of", "grown", "misfit_of", "mixed", "of_sensor", "shared_by_neighbors"]
+__all__ = ["covariance_of", "grown", "misfit_of", "of_sensor", "shared_by_neighbors"]
 
 FloatArray = NDArray[np.float64]
 LEAST_KNOWN = 1e-9  # information on an entry of theta, below which it is none: labels may leave no share to be told
@@ -58,13 +58,6 @@ def grown(covariance: FloatArray, other: FloatArray, those: NDArray[np.bool_]) -
     more: FloatArray = covariance.copy()
     more[part] += (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale)
     return more
-
-
-def mixed(covariance: FloatArray, other: FloatArray, apart: FloatArray, probability: float) -> FloatArray:
-    """Mean square (k, k) of the error of an estimate, where another model is right with some `probability`, whose
-    estimate lies `apart` (k,) from it; each has a covariance (k, k) (Hoeting et al., Statistical Science 14, 1999)."""
-    both: FloatArray = (1.0 - probability) * covariance + probability * (other + np.outer(apart, apart))
-    return both
 
 
 def misfit_of(dependence: Dependence, noise: FloatArray) -> float:

@@ -1,6 +1,6 @@
 """Errors of what was fitted, and intervals of traits, which are not linear in it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,17 @@ class Ends(NamedTuple):
     def with_error(self, below: FloatArray, above: FloatArray) -> "Ends":
         """With another, independent error (t,), positive or negative."""
         return Ends(np.hypot(self.below, below), np.hypot(self.above, above))
+
+    def mixed(self, others: Sequence[tuple[float, FloatArray, "Ends"]], quantile: float) -> "Ends":
+        """Of what may also lie elsewhere: each of the others with its probability, how far (t,) from here it lies, and
+        how far it reaches from there.  In mean squares, as averages over models have it (Hoeting et al., Statistical
+        Science 14, 1999)."""
+        here = 1.0 - sum(p for p, _, _ in others)
+        below, above = here * self.below**2, here * self.above**2
+        for p, apart, ends in others:
+            below = below + p * (ends.below**2 + (quantile * np.minimum(apart, 0.0)) ** 2)
+            above = above + p * (ends.above**2 + (quantile * np.maximum(apart, 0.0)) ** 2)
+        return Ends(np.sqrt(below), np.sqrt(above))
 
 
 def propagated(

@@ -5,45 +5,64 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
+from scipy.special import softmax, stdtrit
 
-from phytofit.engine.covariance import covariance_of, grown, misfit_of, mixed, of_sensor, shared_by_neighbors
+from phytofit.engine.covariance import covariance_of, grown, misfit_of, of_sensor, shared_by_neighbors
 from phytofit.engine.dependence import Dependence, score_dependence, width_misfit
 from phytofit.engine.leaf_end import Ending, ending
 from phytofit.engine.refine import Optimum, optimum_of
 from phytofit.engine.sighting import Sighting, sighting
 from phytofit.engine.tip import gain_of_blunt_end
 from phytofit.engine.whole_pieces import of_whole_pieces
+from phytofit.parameters import ParameterSpace
 
-__all__ = ["Alternative", "Choice", "Estimate", "outcome"]
+__all__ = ["Alternative", "Choice", "Estimate", "Rival", "outcome"]
 
 FloatArray = NDArray[np.float64]
 EXPECTED_BEYOND = 7.0  # points that should lie beyond the last: of a whole leaf 1 in 1,100 has as many
 BLUNTLY = 5.0  # nats by which the last points must say that a leaf ends bluntly
+LEAST_PROBABLE = 0.01  # of an alternative; what one of less would add to an interval is lost beside its own width
 TAPER = "leaf_taper"  # of a leaf that has one of its own, its last points tell where it ends
 
 
-class Alternative(NamedTuple):
-    """Where the leaf ends up that is free to start elsewhere than at the stem's surface, and how probable it is."""
+class Rival(NamedTuple):
+    """Another optimum, and by how many nats it has more evidence than the chosen one: fewer than none."""
 
     optimum: Optimum
-    dependence: Dependence
-    probability: float
+    lead: float
 
 
 class Choice(NamedTuple):
-    """The optimum that the cloud backs best."""
+    """The optimum that the cloud backs best, and others that it may back as well."""
 
     optimum: Optimum
     dependence: Dependence
     tip_doubtful: bool
     blunt: bool
-    rival: FloatArray | None
-    alternative: Alternative | None = None
+    rivals: tuple[Rival, ...] = ()
 
     def lead_of(self, other: Optimum) -> float:
         """Nats by which another optimum has more evidence, points that err alike counted as few for both."""
         return other.log_evidence(self.dependence.inflation) - self.optimum.log_evidence(self.dependence.inflation)
+
+    def beside(self, other: Optimum, lead: float) -> "Choice":
+        """With another optimum that has more evidence by so many nats, fewer than none."""
+        return self._replace(rivals=(*self.rivals, Rival(other, lead)))
+
+    def giving_way(self, optimum: Optimum, dependence: Dependence, lead: float) -> "Choice":
+        """Another optimum in place of this one, which has more evidence by so many nats."""
+        rivals = tuple(rival._replace(lead=rival.lead - lead) for rival in self.rivals)
+        return self._replace(optimum=optimum, dependence=dependence, rivals=rivals)
+
+
+class Alternative(NamedTuple):
+    """Another estimate: parameters x (k,) of the model in `space`, with the covariance (k, k) of their error, and how
+    probable it is that it is the right one."""
+
+    probability: float
+    space: ParameterSpace
+    x: FloatArray
+    covariance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -61,9 +80,9 @@ class Estimate:
     ``inflation``: how many times more the errors vary than those of independent points would; ``misfit_cm``: how far
     the blade's surface lies off the model's, as the errors that neighbours on it share say, and those on the stem do
     not; ``width_misfit``: by what share its width is off the model's, place by place; ``correlated_cm``: how far errors
-    of neighbours on the leaf are correlated, 0 if they are not; ``rival`` (m,): parameters of the other model, if it is
-    about as probable; ``quantile``: standard errors to either side of a 95 % interval, Student's; ``sighting``: what of
-    the phytomer the cloud shows.
+    of neighbours on the leaf are correlated, 0 if they are not; ``alternatives``: other estimates that are probable;
+    ``quantile``: standard errors to either side of a 95 % interval, Student's; ``sighting``: what of the phytomer the
+    cloud shows.
     """
 
     x: FloatArray
@@ -84,7 +103,7 @@ class Estimate:
     misfit_cm: float
     width_misfit: float
     correlated_cm: float
-    rival: FloatArray | None
+    alternatives: tuple[Alternative, ...]
     quantile: float
     converged: bool
     sighting: Sighting
@@ -95,10 +114,6 @@ def outcome(chosen: Choice) -> Estimate:
     posterior, state, at = optimum.posterior, optimum.state, optimum.at
     k = len(state.x)
     covariance, left = covariance_of(posterior, state, at, dependence)
-    if chosen.alternative is not None:
-        other, of_other, p = chosen.alternative
-        there, _ = covariance_of(other.posterior, other.state, other.at, of_other)
-        covariance = mixed(covariance, there, other.state.theta - state.theta, p)
     seen = sighting(posterior, state, at)
     too_long = state.seen == 1.0 and seen.short > EXPECTED_BEYOND * dependence.inflation
     ends = Ending(1.0, np.zeros_like(covariance))
@@ -126,11 +141,27 @@ def outcome(chosen: Choice) -> Estimate:
         misfit_cm=misfit_of(dependence, state.noise),
         width_misfit=width_misfit(posterior, state, at, of_sensor(dependence, state.noise)),
         correlated_cm=dependence.leaf.reach_cm,
-        rival=chosen.rival,
+        alternatives=_alternatives(chosen),
         quantile=float(stdtrit(left, 0.975)),
         converged=converged,
         sighting=seen,
     )
+
+
+def _alternatives(chosen: Choice) -> tuple[Alternative, ...]:
+    """The rivals that are not out of the question, and how probable they are."""
+    leads = np.array([0.0, *(rival.lead for rival in chosen.rivals)])
+    found = []
+    for rival, p in zip(chosen.rivals, softmax(leads)[1:].tolist(), strict=True):
+        if p < LEAST_PROBABLE:
+            continue
+        posterior, state, at = rival.optimum.posterior, rival.optimum.state, rival.optimum.at
+        k = len(state.x)
+        dependence = score_dependence(posterior, state, chosen.dependence)
+        covariance = covariance_of(posterior, state, at, dependence)[0][:k, :k]
+        covariance += np.diag(posterior.space.discrepancy_at(state.x) ** 2)
+        found.append(Alternative(p, posterior.space, state.x, covariance))
+    return tuple(found)
 
 
 def _with_width_of_whole_pieces(

@@ -5,16 +5,16 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from operator import itemgetter
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import pinvh
-from scipy.special import expit
 
 from phytofit.engine.covariance import of_sensor
-from phytofit.engine.dependence import score_dependence
+from phytofit.engine.dependence import Dependence, score_dependence
 from phytofit.engine.layout import State
-from phytofit.engine.outcome import Alternative, Choice, Estimate, outcome
+from phytofit.engine.outcome import Choice, Estimate, outcome
 from phytofit.engine.posterior import Posterior
 from phytofit.engine.refine import (
     COARSE_TOLERANCE,
@@ -41,14 +41,11 @@ LEFT_OUT = 0.1  # share of outliers, above which all starts are tried again with
 HELD_OUTLIERS, HELD_ITERATIONS = 0.1, 12  # at most, then, for each point of the leaf
 HOPELESS = 0.3  # nats for each point, by which a start is behind after the first
 START_NOISE = 0.036  # of the expected leaf's length: wide, so that a start some cm off is drawn in
-CUT_SHARES = (0.85, 0.97)  # of the midrib, from which the search for a missing tip starts; the second of rich leaves
+CUT_SHARES = (0.85, 0.97)  # of the midrib, from which the search for a missing tip starts
 LEAST_GAIN = 12.0  # nats for which a richer leaf is tried: fourteen parameters gain seven by chance, and cost more
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning must fit better
-ABOUT_AS_PROBABLE = 2.5  # nats by which another model may have less evidence: one to twelve
 OF_START = (OFFSET, "leaf_base_bend", "leaf_angle")  # beyond its first twentieth a leaf tells the angles' sum at best
-RARE = 4.6  # nats, a hundred to one: before a cloud is seen, that a leaf is like those of the paper's model
-RICH_CUT = 3  # place of the richer leaf without its tip among those that are chosen from
 LOWER_ROUNDS = 3
 
 LEAST_FACING = 1.0  # concentration, from which a stem was seen from one side: a half of it has 1.6
@@ -72,9 +69,8 @@ def estimate(
     """
     plain = species.leading(len(starts[0][0]))
     cloud = Cloud(points, organ, executor)
-    state = _drawn_in(plain, cloud, starts)
-    chosen = _one_sided(_choice(_candidates(plain, species, cloud, state)))
-    return outcome(_at_surface(_with_hidden_base(chosen)))
+    hypotheses = _hypotheses(plain, species, cloud, _drawn_in(plain, cloud, starts))
+    return outcome(_at_surface(_with_hidden_base(_one_sided(_choice(hypotheses)))))
 
 
 def _drawn_in(plain: Species, cloud: Cloud, starts: Sequence[tuple[FloatArray, FloatArray]]) -> State:
@@ -107,22 +103,64 @@ def _drawn_in(plain: Species, cloud: Cloud, starts: Sequence[tuple[FloatArray, F
     return min(found, key=itemgetter(0))[1]
 
 
-def _candidates(plain: Species, species: Species, cloud: Cloud, state: State) -> list[Optimum]:
-    """Refined: the paper's model, the same with its tip missing, and, if they may gain enough, the two with all
-    parameters of the species."""
-    found = [optimum_near(plain, state, cloud, with_void=True)]
-    hidden = found[0].posterior.hidden
-    found.append(_with_tip_missing(plain, cloud, found[0], CUT_SHARES[:1], thick=False))
+class _Hypothesis(NamedTuple):
+    """A model of the leaf, with the logarithm of its odds before the cloud is seen: its optimum, and how far errors of
+    neighbours depend on each other there; and, where the leaf's last points gain so many nats that its tip may be
+    missing, points that err alike counted as few, the optimum of a leaf that goes on.
+
+    ``tapers`` says whether the taper is estimated too: then the shape says too little of a tip that was not seen to
+    tell how long it is, and the leaf is taken as whole.
+    """
+
+    log_odds: float
+    tapers: bool
+    whole: Optimum
+    dependence: Dependence
+    bluntness: float
+    cut: Optimum | None
+
+    @classmethod
+    def of(cls, species: Species, cloud: Cloud, whole: Optimum, log_odds: float, *, tapers: bool) -> "_Hypothesis":
+        dependence = score_dependence(whole.posterior, whole.state)
+        bluntness = gain_of_blunt_end(whole.posterior, whole.state, whole.at) / dependence.inflation
+        cut = _with_tip_missing(species, cloud, whole, thick=tapers) if bluntness > TIP_DOUBTFUL else None
+        return cls(log_odds, tapers, whole, dependence, bluntness, cut)
+
+    def gain(self, inflation: float) -> float:
+        """Nats by which a missing tip is better: by the leaf's end, and by its shape elsewhere."""
+        if self.cut is None:
+            return 0.0
+        return min(self.bluntness, (self.cut.log_likelihood - self.whole.log_likelihood) / inflation)
+
+    def options(self, inflation: float) -> list[Optimum]:
+        """What may be chosen."""
+        if self.cut is None or self.tapers or self.gain(inflation) <= TIP_MISSING:
+            return [self.whole]
+        return [self.whole, self.cut]
+
+
+def _hypotheses(plain: Species, species: Species, cloud: Cloud, state: State) -> list[_Hypothesis]:
+    """The paper's leaf and, if it may gain enough, the one with all parameters of the species."""
+    found = _Hypothesis.of(plain, cloud, optimum_near(plain, state, cloud, with_void=True), 0.0, tapers=False)
     if len(plain.space) == len(species.space):
-        return found
-    simple = found[1] if found[1].log_likelihood - found[0].log_likelihood > TIP_MISSING else found[0]
-    if _expected_gain(species, simple, cloud) <= LEAST_GAIN:
-        return found
-    rich = _rich(species, cloud, found[0])
-    if rich[0].posterior.void is not found[0].posterior.void:  # all are to have the same
-        hidden = _void_alone(rich[0])
-        found = [optimum_near(plain, it.state, cloud, cut=i == 1, hidden=hidden) for i, it in enumerate(found)]
-    return [*found, *rich]
+        return [found]
+    if _expected_gain(species, found.options(1.0)[-1], cloud) <= LEAST_GAIN:
+        return [found]
+    simple = found.whole
+    with_noise = cloud._replace(leaf_noise_cm=float(simple.state.noise[0]))  # about that of the stem's points
+    rich = _rich(species, with_noise, simple)
+    if rich.posterior.void is not simple.posterior.void:  # all are to have the same
+        whole = optimum_near(plain, simple.state, cloud, hidden=_void_alone(rich))
+        found = _Hypothesis.of(plain, cloud, whole, 0.0, tapers=False)
+    return [found, _Hypothesis.of(species, with_noise, rich, float(np.log(species.own_shape_odds)), tapers=True)]
+
+
+def _with_tip_missing(species: Species, cloud: Cloud, whole: Optimum, *, thick: bool) -> Optimum:
+    """The optimum near a whole one, of a leaf that goes on, from the best of some shares of the midrib."""
+    hidden, part = whole.posterior.hidden, cloud.part(FEW_POINTS)
+    coarse = partial(optimum_near, species, thick=thick, cut=True, tolerance=COARSE_TOLERANCE, hidden=hidden)
+    best = max((coarse(_cut(whole.state, share), part) for share in CUT_SHARES), key=_log_likelihood)
+    return optimum_near(species, best.state, cloud, thick=thick, cut=True, hidden=best.posterior.hidden)
 
 
 def _void_alone(optimum: Optimum) -> Hidden | None:
@@ -131,10 +169,9 @@ def _void_alone(optimum: Optimum) -> Hidden | None:
     return None if hidden is None or hidden.void is None else hidden.without_holes()
 
 
-def _rich(species: Species, cloud: Cloud, simple: Optimum) -> tuple[Optimum, Optimum]:
-    """With all parameters of the species, whole and with the tip missing: the best optimum of several restarts, which
-    is found with a part of the points."""
-    cloud = cloud._replace(leaf_noise_cm=float(simple.state.noise[0]))
+def _rich(species: Species, cloud: Cloud, simple: Optimum) -> Optimum:
+    """The best optimum of several restarts with all parameters of the species, which is found with a part of the
+    points."""
     part = cloud.part(FEW_POINTS)
     known = _void_alone(simple)
     richer = part.posterior(species, thick=True, hidden=known)
@@ -143,24 +180,7 @@ def _rich(species: Species, cloud: Cloud, simple: Optimum) -> tuple[Optimum, Opt
     coarse = partial(optimum_near, species, thick=True, tolerance=COARSE_TOLERANCE)
     best = max((coarse(it, part, hidden=known) for it in starts), key=_log_likelihood)
     best = _restarted(species, part, best)
-    best = optimum_near(species, best.state, cloud, thick=True, hidden=best.posterior.hidden, with_void=True)
-    return best, _with_tip_missing(species, cloud, best, CUT_SHARES, thick=True)
-
-
-def _with_tip_missing(
-    species: Species, cloud: Cloud, whole: Optimum, shares: Sequence[float], *, thick: bool
-) -> Optimum:
-    """The optimum near a whole one, of a leaf whose tip is missing, from the best of so many shares of its midrib; as a
-    part of the points has it, where that has no use for it."""
-    hidden, part = whole.posterior.hidden, cloud.part(FEW_POINTS)
-    coarse = partial(optimum_near, species, thick=thick, cut=True, tolerance=COARSE_TOLERANCE, hidden=hidden)
-    cut = max((coarse(_cut(whole.state, share), part) for share in shares), key=_log_likelihood)
-    posterior = part.posterior(species, thick=thick, hidden=hidden)
-    of_whole = Optimum(posterior, whole.state, posterior.evaluate(whole.state, derivatives=False), converged=False)
-    if cut.log_likelihood - of_whole.log_likelihood > TIP_DOUBTFUL:
-        return optimum_near(species, cut.state, cloud, thick=thick, cut=True, hidden=cut.posterior.hidden)
-    posterior = cloud.posterior(species, thick=thick, cut=True, hidden=hidden)
-    return Optimum(posterior, cut.state, posterior.evaluate(cut.state), converged=False)
+    return optimum_near(species, best.state, cloud, thick=True, hidden=best.posterior.hidden, with_void=True)
 
 
 def _log_likelihood(optimum: Optimum) -> float:
@@ -190,47 +210,43 @@ def _better(species: Species, cloud: Cloud, best: Optimum, restart: Callable[[Op
     return best
 
 
-def _choice(found: Sequence[Optimum]) -> Choice:
-    """Of models whole and with the tip missing, in turn, the one with the most evidence; a tip is missing only where
-    that makes the points clearly more probable.
-
-    Of a richer leaf the taper is estimated too, and says little of a tip that was not seen: it is taken as whole.
-    """
-    richest = found[-1]  # least misfit
-    dependence = score_dependence(richest.posterior, richest.state)
+def _choice(hypotheses: Sequence[_Hypothesis]) -> Choice:
+    """Of the hypotheses, whole or with the tip missing, the one with the most evidence, and the others by how probable
+    they are; a tip is missing only where that makes the points clearly more probable."""
+    last = hypotheses[-1]
+    richest, dependence = last.whole, last.dependence  # least misfit
     inflation, sensors = dependence.inflation, of_sensor(dependence, richest.state.noise)
     if sensors.correlation < dependence.leaf.correlation:  # the rest is misfit, of which a better model has less
         without = replace(dependence, leaf=sensors)
         inflation = score_dependence(richest.posterior, richest.state, without).inflation
-    fits = [optimum.log_likelihood / dependence.inflation for optimum in found]
-    gains = [0.0] * len(found)  # by a missing tip
-    for whole in range(0, len(found), 2):
-        gain = fits[whole + 1] - fits[whole]
-        if gain > TIP_DOUBTFUL:  # if the leaf's end says so too, not only its shape elsewhere
-            optimum = found[whole]
-            gain = min(gain, gain_of_blunt_end(optimum.posterior, optimum.state, optimum.at) / dependence.inflation)
-        gains[whole] = gains[whole + 1] = gain
-    odds = [0.0, 0.0, RARE, RARE]
-    evidence = [optimum.log_evidence(inflation) + o for optimum, o in zip(found, odds, strict=False)]
-    backed = [e if i % 2 == 0 or gains[i] > TIP_MISSING else -np.inf for i, e in enumerate(evidence)]
-    best = int(np.argmax(backed))
-    others = [i for i in range(len(found)) if i // 2 != best // 2 and backed[i] > backed[best] - ABOUT_AS_PROBABLE]
-    rival = found[max(others, key=lambda i: backed[i])].state.x if others else None
-    blunt = best == RICH_CUT
-    best -= blunt
-    if best < len(found) - 1:
-        dependence = score_dependence(found[best].posterior, found[best].state, dependence)
-    doubtful = best % 2 == 0 and gains[best] > TIP_DOUBTFUL
-    return Choice(found[best], dependence, doubtful, blunt, rival)
+    options = [
+        (it.log_odds + optimum.log_evidence(inflation), number, optimum)
+        for number, it in enumerate(hypotheses)
+        for optimum in it.options(dependence.inflation)
+    ]
+    evidence, best, optimum = max(options, key=itemgetter(0))
+    whole, gain = optimum is hypotheses[best].whole, hypotheses[best].gain(dependence.inflation)
+    chosen = Choice(
+        optimum,
+        dependence if optimum is richest else score_dependence(optimum.posterior, optimum.state, dependence),
+        tip_doubtful=whole and gain > TIP_DOUBTFUL,
+        blunt=whole and gain > TIP_MISSING,
+    )
+    for number in range(len(hypotheses)):
+        if number != best:
+            nats, _, rival = max((it for it in options if it[1] == number), key=itemgetter(0))
+            chosen = chosen.beside(rival, nats - evidence)
+    return chosen
 
 
 def _one_sided(chosen: Choice) -> Choice:
     """Of a stem that was seen from one side, the fit that knows it, where it has more evidence."""
     posterior = chosen.optimum.posterior
     optimum = optimum_of(posterior.under(posterior.prior.one_sided()), chosen.optimum.state)
-    if np.linalg.norm(optimum.state.facing) < LEAST_FACING or chosen.lead_of(optimum) < 0.0:
+    lead = chosen.lead_of(optimum)
+    if np.linalg.norm(optimum.state.facing) < LEAST_FACING or lead < 0.0:
         return chosen
-    return chosen._replace(optimum=optimum, dependence=score_dependence(optimum.posterior, optimum.state))
+    return chosen.giving_way(optimum, score_dependence(optimum.posterior, optimum.state), lead)
 
 
 def _with_hidden_base(chosen: Choice) -> Choice:
@@ -258,11 +274,8 @@ def _at_surface(chosen: Choice) -> Choice:
     lead = chosen.lead_of(optimum)
     if lead < 0.0:
         return chosen
-    return chosen._replace(
-        optimum=optimum,
-        dependence=score_dependence(held, optimum.state, chosen.dependence),
-        alternative=Alternative(chosen.optimum, chosen.dependence, float(expit(-lead))),
-    )
+    dependence = score_dependence(held, optimum.state, chosen.dependence)
+    return chosen.giving_way(optimum, dependence, lead).beside(chosen.optimum, -lead)
 
 
 def _expected_gain(species: Species, optimum: Optimum, cloud: Cloud) -> float:
@@ -275,6 +288,6 @@ def _expected_gain(species: Species, optimum: Optimum, cloud: Cloud) -> float:
     return 0.5 * float(gradient[free] @ inverse @ gradient[free])
 
 
-def _cut(state: State, share: float = CUT_SHARES[0]) -> State:
+def _cut(state: State, share: float) -> State:
     """The state with a longer leaf, of which as much is seen as of the one that it had."""
     return longer(state, 1.0 / share).changed(midrib_seen=share)

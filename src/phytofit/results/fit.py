@@ -1,14 +1,17 @@
 """Fit: the most probable phytomer of a cloud, and its traits with their intervals."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phytofit.engine.intervals import Ends, propagated
-from phytofit.engine.outcome import Estimate
+from phytofit.engine.outcome import Alternative, Estimate
 from phytofit.models import STEM, Organ
+from phytofit.parameters import ParameterSpace
 from phytofit.results.fitted import FittedPhytomer
 from phytofit.traits import Trait, measure
 
@@ -16,6 +19,8 @@ __all__ = ["Fit"]
 
 FloatArray = NDArray[np.float64]
 INTERVAL_METHOD = "sandwich interval"
+ABOUT_AS_PROBABLE = 0.08  # from which what another estimate has is worth a remark
+COMPARED = ("stem_diameter", "leaf_length", "leaf_angle", "leaf_insertion_angle", "leaf_width")
 OPEN_WITHOUT_TIP = ("leaf_length", "leaf_area")  # no upper end where the tip was not seen
 
 
@@ -37,10 +42,16 @@ class Fit(FittedPhytomer):
     @property
     def parameter_intervals(self) -> dict[str, tuple[float, float]]:
         """95 % interval of each parameter, within its bounds."""
-        space = self.species.space
-        half = self.estimate.quantile * np.sqrt(np.diag(self.covariance))
-        low = self._in_units(np.minimum(np.maximum(self.x - half, space.lower), self.x)).tolist()
-        high = self._in_units(np.maximum(np.minimum(self.x + half, space.upper), self.x)).tolist()
+        space, quantile = self.species.space, self.estimate.quantile
+        half = quantile * np.sqrt(np.diag(self.covariance))
+        others = [
+            (it.probability, it.x - self.x, Ends(*[quantile * np.sqrt(np.diag(it.covariance))] * 2))
+            for it in self.estimate.alternatives
+            if it.space.names == space.names
+        ]
+        ends = Ends(half, half).mixed(others, quantile)
+        low = self._in_units(np.minimum(np.maximum(self.x - ends.below, space.lower), self.x)).tolist()
+        high = self._in_units(np.maximum(np.minimum(self.x + ends.above, space.upper), self.x)).tolist()
         return dict(zip(space.names, zip(low, high, strict=True), strict=True))
 
     @property
@@ -83,7 +94,15 @@ class Fit(FittedPhytomer):
             return None
         turn, others = turned
         covariance, of_traits = (turn @ each @ turn.T for each in (self.covariance, self.trait_covariance))
-        return replace(self, **others, covariance=covariance, trait_covariance=of_traits)
+        made = replace(self.estimate, alternatives=tuple(self._turned_alternatives()))
+        return replace(self, **others, covariance=covariance, trait_covariance=of_traits, estimate=made)
+
+    def _turned_alternatives(self) -> Iterator[Alternative]:
+        for it in self.estimate.alternatives:
+            found = self.species.model.upside_down(it.x)
+            if found is not None:
+                turn, offset, _ = found
+                yield it._replace(x=turn @ it.x + offset, covariance=turn @ it.covariance @ turn.T)
 
     def _organs_of(self, x: FloatArray, *, whole: bool = False) -> tuple[Organ, ...]:
         stem, leaf = self._scaled_organs(x)
@@ -120,12 +139,16 @@ class Fit(FittedPhytomer):
         return float(whole.segment_lengths.sum() - part.segment_lengths.sum())
 
     def _ends(self) -> Ends:
-        """How far the traits' intervals reach: by the errors of the parameters, by how far the blade's surface lies
-        off the model's where it leaves the stem, by how far its width does, and by what the stem hides of it."""
+        """How far the traits' intervals reach, as it may be this estimate that is right or another."""
+        return self._own_ends.mixed(self._alternatives, self.estimate.quantile)
+
+    @cached_property
+    def _own_ends(self) -> Ends:
+        """How far the intervals reach if this estimate is right: by the errors of the parameters, by how far the
+        blade's surface lies off the model's where it leaves the stem, by how far its width does, and by what the stem
+        hides of it."""
         space, made = self.species.space, self.estimate
-        angle = np.array(space.units) == "deg"
-        lower, upper = np.where(angle, -np.inf, space.lower), np.where(angle, np.inf, space.upper)
-        ends = propagated(self._values, self.x, self.trait_covariance, made.quantile, lower, upper)
+        ends = propagated(self._values, self.x, self.trait_covariance, made.quantile, *_within(space))
         off = made.quantile * made.misfit_cm * self.scale
         values, measured = self._values(self.x), self._measured(self.x)
         changes = np.array([self._values(self.x, thicker=by) for by in (off, -off)]) - values
@@ -141,6 +164,31 @@ class Fit(FittedPhytomer):
         by_stem = (names == "leaf_length") * (inside + below) + (names == "leaf_area") * strip
         return ends.with_error(by_width, by_width + by_stem)
 
+    @cached_property
+    def _alternatives(self) -> list[tuple[float, FloatArray, Ends]]:
+        """How probable other estimates are, how far (t,) from this one their traits lie, and how far these reach."""
+        made, values = self.estimate, self._values(self.x)
+        whole = partial(self._values, whole=True)
+        found = []
+        for p, space, x, covariance in made.alternatives:
+            ends = propagated(whole, x, covariance, made.quantile, *_within(space))
+            found.append((p, whole(x) - values, ends))
+        return found
+
+    @property
+    def beside_alternatives(self) -> dict[str, float]:
+        """Values of those traits that another estimate, about as probable, has beyond the interval of this one, in
+        cm and degrees."""
+        own, names = self._own_ends, [trait.name for trait in self._measured(self.x)]
+        found: dict[str, float] = {}
+        for p, apart, _ in self._alternatives:
+            if p < ABOUT_AS_PROBABLE:
+                continue
+            beyond = np.isfinite(apart) & ((apart > own.above) | (apart < -own.below))
+            values = self._values(self.x) + apart
+            found |= {names[i]: float(values[i]) for i in np.flatnonzero(beyond) if names[i] in COMPARED}
+        return found
+
     def _further_down(self, off: float, angle: float) -> float:
         """How much further down its stem, cm, a leaf at this angle, deg, may start that lies `off` cm off where it was
         fitted: it nears the stem as its chord does, below its midrib's start as well."""
@@ -152,3 +200,9 @@ class Fit(FittedPhytomer):
         stem, leaf = self._organs_of(x, whole=whole)
         stem = replace(stem, half_width=np.maximum(stem.half_width + thicker, 0.0))
         return np.array([trait.value for trait in measure((stem, leaf), chord_cm=self._chord_cm)])
+
+
+def _within(space: ParameterSpace) -> tuple[FloatArray, FloatArray]:
+    """Bounds (k,) of the parameters, but of angles, for which 0 is no end."""
+    angle = np.array(space.units) == "deg"
+    return np.where(angle, -np.inf, space.lower), np.where(angle, np.inf, space.upper)

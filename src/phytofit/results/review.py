@@ -3,8 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
-
 from phytofit.engine.sighting import OFFSET, Sighting
 from phytofit.errors import ONE_LEAF_ONLY, NoPhytomerError
 from phytofit.results.fit import Fit
@@ -35,7 +33,6 @@ THICK_STEM = (
 )
 NO_LEAF = "no leaf in this cloud: what looks most like one is as short as a leaf of {} can be, {:g} cm; check the unit"
 SEVERAL_LEAVES = f"this looks like a whole plant, or more than one leaf: {{}}; {ONE_LEAF_ONLY}"
-COMPARED = ("stem_diameter", "leaf_length", "leaf_angle", "leaf_width")  # with those of a rival
 FOLLOWS = {  # the traits that follow from a parameter
     "stem_diameter": ("stem_diameter",),
     "stem_diameter_above": ("stem_diameter",),
@@ -160,19 +157,13 @@ def _lacks_stem(result: Fit) -> bool:
 
 
 def beside_its_rival(result: Fit) -> Fit:
-    """The result, with a remark if another model is about as probable and its traits lie beyond the intervals."""
-    if result.estimate.rival is None:
+    """The result, with a remark if another estimate is about as probable and its traits lie beyond the intervals."""
+    other = result.beside_alternatives
+    if not other:
         return result
-    other = dict(zip([t.name for t in result.traits], result._values(result.estimate.rival, whole=True), strict=True))
-    differ = [
-        t
-        for t in result.traits
-        if t.name in COMPARED and not (t.low or 0.0) <= other[t.name] <= (np.inf if t.high is None else t.high)
-    ]
-    if not differ:
-        return result
-    others = ", ".join(f"{t.name} may be {other[t.name]:.3g} {t.unit}" for t in differ)
-    found = remark("two_fits", traits=[t.name for t in differ], others=others)
+    units = {t.name: t.unit for t in result.traits}
+    others = ", ".join(f"{name} may be {value:.3g} {units[name]}" for name, value in other.items())
+    found = remark("two_fits", traits=list(other), others=others)
     return replace(result, observed=(*result.observed, found))
 
 

@@ -27,13 +27,16 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MOST, le=M
 class Species:
     """A plant species (or cultivar) as the fit sees it.
 
-    ``space`` is the prior of the model's parameters; ``ranges`` (k, 2) what a simulation draws from, uniformly.
+    ``space`` is the prior of the model's parameters; ``ranges`` (k, 2) what a simulation draws from, uniformly;
+    ``own_shape_odds`` to one are the odds, before a cloud is seen, that a leaf has a shape of its own, not that of the
+    first six parameters.
     """
 
     name: str
     model: Phytomer
     space: ParameterSpace
     ranges: NDArray[np.float64]
+    own_shape_odds: float = 100.0
 
     def leading(self, n: int) -> "Species":
         """The species with the first `n` of its parameters only: 6 are the paper's."""
@@ -74,6 +77,7 @@ class _File(BaseModel):
     model_config = ConfigDict(extra="forbid")
     name: Annotated[str, Field(min_length=1)]
     model: Literal["phytomer"]
+    own_shape_odds: Annotated[Number, Field(gt=0)] = 100.0
     constants: _Constants = _Constants()
     parameters: dict[str, _Parameter]
 
@@ -134,4 +138,4 @@ def _assemble(file: _File, where: str) -> Species:
             raise SpeciesError(f"{where}: {error}") from None
         ranges.append(p.range)
     model = Phytomer(**file.constants.model_dump())
-    return Species(one_line(file.name), model, ParameterSpace(parameters), np.array(ranges, float))
+    return Species(one_line(file.name), model, ParameterSpace(parameters), np.array(ranges, float), file.own_shape_odds)
