@@ -179,8 +179,10 @@ class Fit(FittedPhytomer):
     def beside_alternatives(self) -> dict[str, float]:
         """Values of those traits that another estimate, about as probable, has beyond the interval of this one, in
         cm and degrees."""
-        own, names = self._own_ends, [trait.name for trait in self._measured(self.x)]
         found: dict[str, float] = {}
+        if not self.estimate.alternatives:
+            return found
+        own, names = self._own_ends, [trait.name for trait in self._measured(self.x)]
         for p, apart, _ in self._alternatives:
             if p < ABOUT_AS_PROBABLE:
                 continue
