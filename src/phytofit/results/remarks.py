@@ -202,11 +202,12 @@ KINDS = {
     # the whole
     "two_fits": Kind(
         (),
-        POOR,
+        CHECK,
         "two fits are about equally probable: {others}",
-        "Look at fit.png",
-        "Two models explain the points about equally well, and the second one's values lie beyond the intervals. "
-        "Touches the traits that it names.",
+        "Look at fit.png: the interval is that of both",
+        "Two models explain the points about equally well, and the second one's values lie beyond the intervals that "
+        "the first would have by itself. The intervals that are given are those of both. Touches the traits that it "
+        "names.",
         "two fits are about equally probable",
     ),
     "not_converged": Kind(
