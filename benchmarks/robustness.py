@@ -313,8 +313,9 @@ def among_pieces(points: np.ndarray, random: np.random.Generator) -> np.ndarray:
 
 
 def field_length(job: tuple[str, int, np.ndarray]) -> tuple[float, float, float, bool, bool, float, float]:
-    """Leaf length and its interval, whether its tip is said to be missing, whether it has a flag, and how far the
-    sphere was from the leaf's ends, base and tip, or the next piece of another; midrib (k, 3) of the untouched leaf."""
+    """Leaf length and its interval (not a number where the cloud is refused), whether its tip is said to be missing,
+    whether it has a flag, and how far the sphere was from the leaf's ends, base and tip, or the next piece of another;
+    midrib (k, 3) of the untouched leaf."""
     how, number, midrib = job
     points, away, seed_point = field_points(), np.full(2, np.inf), None
     random = np.random.default_rng(number)
@@ -328,7 +329,10 @@ def field_length(job: tuple[str, int, np.ndarray]) -> tuple[float, float, float,
         crowded, seed_point = among_pieces(points, random), midrib[list(SEEDED)]  # it has gaps: one for each piece
         away[0] = cKDTree(points).query(crowded[len(points) :])[0].min()
         points = crowded
-    result = phytofit.fit(points, "cm", random_start=True, seed=number, threads=1, seed_point=seed_point)
+    try:
+        result = phytofit.fit(points, "cm", random_start=True, seed=number, threads=1, seed_point=seed_point)
+    except phytofit.NoPhytomerError:
+        return np.nan, np.nan, np.nan, False, True, *away
     length = next(t for t in result.traits if t.name == "leaf_length")
     high = np.inf if length.high is None else length.high
     return length.value, length.low, high, not result.estimate.tip_seen, bool(result.flags), *away
@@ -343,6 +347,8 @@ def field(pool: ProcessPoolExecutor) -> None:
     for how in ("noise", "sphere", "pieces"):
         jobs = [(how, number, whole.organs[1].axis) for number in range(1, COPIES + 1)]
         measured = np.array(list(progress(pool.map(field_length, jobs), COPIES))).T
+        refused = int(np.isnan(measured[0]).sum())
+        measured = measured[:, np.isfinite(measured[0])]
         value, low, high, missing, flagged, near, away = measured
         kept = away > 3.0 + 1.0  # cm: the sphere's radius, and some: it took nothing of the tip
         off = np.abs(value - untouched)
@@ -351,6 +357,7 @@ def field(pool: ProcessPoolExecutor) -> None:
             f"  {how:7} {COPIES} copies, {kept.sum()} with the tip: within 1 cm {np.sum(off[kept] <= 1.0)}, "
             f"median {np.median(off[kept]):.2f} cm off, at most {off[kept].max():.2f}; "
             f"interval holds it for {100 * held:.0f} % of all; tip missing or doubtful: {missing.sum():.0f}"
+            f"{f'; refused: {refused}' if refused else ''}"
         )
         for i in np.flatnonzero(off > 1.0):
             at = {

@@ -46,12 +46,16 @@ NOT_JUDGED = {  # name, or module.name: why
     "leaf_end.STEP": "numerical precision",
     "leaf_end.NOTHING": "numerical precision",
     "posterior.STEP": "numerical precision",
-    "posterior.POSE_STEP": "numerical precision",
+    "posterior.PLACE_STEP": "numerical precision",
+    "posterior.FACING_STEP": "numerical precision",
+    "posterior.RING": "no number",
+    "visibility.CELLS": "follows from others",
     "prior.NO_THICKNESS_CM": "numerical precision",
     "leaf_end.NODES": "equation",
     "leaf_end.SHARES": "equation",
     "leaf_end.STRAY": "numerical precision",
-    "tip.POINTED": "numerical precision",
+    "tip.THIN": "numerical precision",
+    "tip.N_PROFILE": "numerical precision",
     "tip.STRAY": "numerical precision",
     "review.NEAR_BOUND": "numerical precision",
     "scoring.NO_DAMPING": "numerical precision",
@@ -66,7 +70,6 @@ NOT_JUDGED = {  # name, or module.name: why
     "nearest.MAX_CELLS": "speed alone",
     "nearest.MAX_BINS": "speed alone",
     "target_leaf.NOBODY": "a label",
-    "search.RICH_CUT": "a place in a list",
 }
 
 

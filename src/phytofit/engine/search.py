@@ -46,7 +46,7 @@ LEAST_GAIN = 12.0  # nats for which a richer leaf is tried: fourteen parameters 
 TIP_MISSING, TIP_DOUBTFUL = 5.0, 2.5  # nats by which a missing tip must fit better: by chance 1 in 1,300, 1 in 80
 CLEARLY_BETTER = 5.0  # nats, by which what starts from another beginning must fit better
 OF_START = (OFFSET, "leaf_base_bend", "leaf_angle")  # beyond its first twentieth a leaf tells the angles' sum at best
-LOWER_ROUNDS = 3
+ROUNDS = 4  # of restarts, at most
 
 LEAST_FACING = 1.0  # concentration, from which a stem was seen from one side: a half of it has 1.6
 
@@ -180,7 +180,10 @@ def _rich(species: Species, cloud: Cloud, simple: Optimum) -> Optimum:
     coarse = partial(optimum_near, species, thick=True, tolerance=COARSE_TOLERANCE)
     best = max((coarse(it, part, hidden=known) for it in starts), key=_log_likelihood)
     best = _restarted(species, part, best)
-    return optimum_near(species, best.state, cloud, thick=True, hidden=best.posterior.hidden, with_void=True)
+    best = coarse(best.state, cloud, hidden=best.posterior.hidden, with_void=True)
+    if best.posterior.void is not simple.posterior.void:  # beside it other hills may be higher
+        best = _restarted(species, part, coarse(best.state, part, hidden=best.posterior.hidden))
+    return optimum_near(species, best.state, cloud, thick=True, hidden=best.posterior.hidden)
 
 
 def _log_likelihood(optimum: Optimum) -> float:
@@ -189,14 +192,13 @@ def _log_likelihood(optimum: Optimum) -> float:
 
 def _restarted(species: Species, cloud: Cloud, best: Optimum) -> Optimum:
     """The best optimum so far, or that of a restart which fits better: with a turned blade, more leaf or stem, a
-    midrib along the points, or, some times in a row, an insertion lower down."""
-    for restart in (turned_blade, longer_leaf, longer_stem, along_points):
-        best = _better(species, cloud, best, restart)
-    for _ in range(LOWER_ROUNDS):
-        lower = _better(species, cloud, best, lower_insertion)
-        if lower is best:
+    midrib along the points, an insertion lower down; again from where these lead, as long as they lead anywhere."""
+    for _ in range(ROUNDS):
+        before = best
+        for restart in (turned_blade, longer_leaf, longer_stem, along_points, lower_insertion):
+            best = _better(species, cloud, best, restart)
+        if best is before:
             break
-        best = lower
     return best
 
 
