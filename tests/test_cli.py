@@ -36,6 +36,19 @@ def clouds(tmp_path_factory):
     return folder
 
 
+def test_fewer_simulated_clouds_take_the_place_of_more(tmp_path):
+    """No cloud stands beside a table that does not know it; what is the user's stays."""
+    (tmp_path / "phytomers.txt").write_text("mine")
+    for number in (3, 1):
+        assert run("simulate", "-n", number, "--points", "200", "--out", tmp_path).exit_code == 0
+    assert {p.name for p in tmp_path.iterdir()} - {"phytofit.log"} == {
+        "phytomer_0001.ply",
+        "phytomer_0001.json",
+        "truth.csv",
+        "phytomers.txt",
+    }
+
+
 def test_simulate_writes_clouds_and_their_truth(clouds):
     names = {p.name for p in clouds.iterdir()}
     expected = {f"phytomer_000{i}.{end}" for i in (1, 2) for end in ("ply", "json")}

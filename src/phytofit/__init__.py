@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from phytofit.reconstruct import CAMERAS, Camera, Reconstruction, load_camera, reconstruct
     from phytofit.results import Fit, PaperFit, Remark
     from phytofit.segmentation import Segmentation, SegmentedLeaf, segment, separate_plants
-    from phytofit.simulation import SimulatedPhytomer, simulate
+    from phytofit.simulation import SimulatedPhytomer, SimulatedPlant, simulate, simulate_plant
     from phytofit.species import Species, load_species
     from phytofit.traits import Trait, measure
     from phytofit.validation import Agreement, Comparison, agreement, compare, read_measures, read_results
@@ -57,6 +57,7 @@ __all__ = [
     "SegmentedLeaf",
     "SettingError",
     "SimulatedPhytomer",
+    "SimulatedPlant",
     "Species",
     "SpeciesError",
     "Status",
@@ -81,6 +82,7 @@ __all__ = [
     "segment",
     "separate_plants",
     "simulate",
+    "simulate_plant",
     "write_cloud",
 ]
 
@@ -134,7 +136,9 @@ MODULES = {  # that are imported when the first of their names is asked for, so 
     ),
     "phytofit.simulation": (
         "SimulatedPhytomer",
+        "SimulatedPlant",
         "simulate",
+        "simulate_plant",
     ),
     "phytofit.species": (
         "Species",

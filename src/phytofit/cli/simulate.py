@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -30,21 +30,30 @@ from phytofit.cli.settings import defaults_of, entries_of
 from phytofit.errors import SettingError
 
 if TYPE_CHECKING:
-    from phytofit.simulation import SimulatedPhytomer
     from phytofit.species import Species
 
 __all__ = ["simulate_command"]
 
 SPECIES = defaults_of("species", "load_species")["species"]
 STEM_ABOVE = [*entries_of("species", "STEM_ABOVE")]
-SIMULATE = defaults_of("simulation", "simulate")
+SIMULATE, PLANTS = defaults_of("simulation", "simulate"), defaults_of("simulation", "simulate_plant")
+FOR_PHYTOMERS = ["parameters", "stem_above", "spheres", "sphere_diameter"]
 
 
 @command("simulate")
 def simulate_command(
     context: typer.Context,
     folder: OutOption = Path("simulated"),
-    number: Annotated[int, numeric("How many phytomers.", "--number", "-n", least=1, most=9999)] = 1,
+    number: Annotated[int, numeric("How many phytomers, or plants.", "--number", "-n", least=1, most=9999)] = 1,
+    plant: Annotated[
+        bool, typer.Option("--plant", metavar="", help="Whole plants, of all ages: a stem with its leaves.")
+    ] = False,
+    leaves: Annotated[
+        int | None, numeric("Of each plant in the end; otherwise drawn.", "--leaves", least=1, most=100)
+    ] = None,
+    unfolded: Annotated[
+        int | None, numeric("How many of them have unfolded; otherwise drawn.", "--unfolded", least=1, most=100)
+    ] = None,
     species: SpeciesOption = SPECIES,
     parameters: Annotated[
         list[str] | None,
@@ -60,8 +69,13 @@ def simulate_command(
         ),
     ] = SIMULATE["stem_above"],
     points: Annotated[
-        int, numeric("Points on each, before spheres are removed.", least=1, most=MOST_POINTS)
-    ] = SIMULATE["n_points"],
+        int | None,
+        numeric(
+            f"Points on each, before spheres are removed; {SIMULATE['n_points']}, of plants {PLANTS['n_points']}.",
+            least=1,
+            most=MOST_POINTS,
+        ),
+    ] = None,
     noise: NoiseOption = SIMULATE["noise_cm"],
     noise_reach: NoiseReachOption = SIMULATE["noise_reach_cm"],
     views: ViewsOption = SIMULATE["n_views"],
@@ -73,46 +87,61 @@ def simulate_command(
     ] = False,
     seed: Seed = SIMULATE["seed"],
 ) -> None:
-    """Draw phytomers from a species' ranges and scan them: clouds with their true parameters and traits.
+    """Draw phytomers, or with --plant whole plants, of a species and scan them: clouds whose truth is known.
 
-    Writes DIR/phytomer_0001.ply (cm, with labels), phytomer_0001.json (its truth) and so on; DIR/truth.csv over all.
+    Phytomers are drawn from the species' ranges, plants from its grammar. Writes DIR/phytomer_0001.ply (cm, with
+    labels: 1 stem, 2 leaf), phytomer_0001.json (its truth) and so on; of plants, DIR/plant_0001.ply (labels: 1 stem, 2
+    the lowest leaf, 3 the next), plant_0001_mesh.ply and plant_0001.json; DIR/truth.csv, the true traits, over all.
 
-    Example:
+    Examples:
 
         phytofit simulate --number 10 --noise 0.5 --spheres 1 --set leaf_length=60 --out simulated
+
+        phytofit simulate --plant --number 3 --views 6 --out plants
     """
-    from phytofit.io import save_simulated
-    from phytofit.simulation import simulate
+    from phytofit.io import save_simulated, save_simulated_plants
+    from phytofit.simulation import simulate, simulate_plant
     from phytofit.species import load_species
 
     if not spheres:
         only(context, ["sphere_diameter"], "it changes nothing without --spheres; leave it out")
+    if plant:
+        only(context, FOR_PHYTOMERS, "it is for phytomers; leave it or --plant out")
+    else:
+        only(context, ["leaves", "unfolded"], "it is for whole plants; add --plant or leave it out")
     chosen = load_species(species)
     fixed = _parse_parameters(parameters or [], chosen)
+    scan: dict[str, Any] = {
+        "noise_cm": noise,
+        "noise_reach_cm": noise_reach,
+        "n_views": views,
+        "outlier_share": outliers,
+        "random_orientation": not upright,
+    } | ({} if points is None else {"n_points": points})
+    kind = "plant" if plant else "phytomer"
     with results_in(folder):
-        phytomers = Items(1, "phytomer")
-        with phytomers.item(0, "simulated phytomers") as told:
+        items = Items(1, kind)
+        with items.item(0, f"simulated {kind}s") as told:
 
-            def drawn() -> Iterator["SimulatedPhytomer"]:
+            def seeds() -> Iterator[int]:
                 for i in range(number):
                     told(f"{i + 1} of {number}", i / number)
-                    yield simulate(
-                        chosen,
-                        fixed=fixed,
-                        stem_above=stem_above,
-                        n_points=points,
-                        noise_cm=noise,
-                        noise_reach_cm=noise_reach,
-                        n_views=views,
-                        n_spheres=spheres,
-                        sphere_diameter_cm=sphere_diameter,
-                        outlier_share=outliers,
-                        random_orientation=not upright,
-                        seed=seed + i,
-                    )
+                    yield seed + i
 
-            save_simulated(drawn(), chosen, folder)
-        say(f"{number} {'phytomers' if number > 1 else 'phytomer'} in {folder}, true traits in {folder / 'truth.csv'}")
+            if plant:
+                plants = (
+                    simulate_plant(chosen, n_leaves=leaves, n_collars=unfolded, **scan, seed=one) for one in seeds()
+                )
+                save_simulated_plants(plants, folder)
+            else:
+                of_phytomer: dict[str, Any] = {
+                    "n_spheres": spheres,
+                    "sphere_diameter_cm": sphere_diameter,
+                    "stem_above": stem_above,
+                }
+                phytomers = (simulate(chosen, fixed=fixed, **of_phytomer, **scan, seed=one) for one in seeds())
+                save_simulated(phytomers, chosen, folder)
+        say(f"{number} {kind}{'s' if number > 1 else ''} in {folder}, true traits in {folder / 'truth.csv'}")
 
 
 def _parse_parameters(texts: list[str], species: "Species") -> dict[str, float]:

@@ -31,7 +31,7 @@ from phytofit.io.replacing import (
     whole_files,
     whole_folder,
 )
-from phytofit.io.simulated import save_simulated
+from phytofit.io.simulated import save_simulated, save_simulated_plants
 from phytofit.io.tables import (
     FolderTable,
     check_table,
@@ -74,6 +74,7 @@ __all__ = [
     "save_reconstruction",
     "save_segmentation",
     "save_simulated",
+    "save_simulated_plants",
     "table_text",
     "trait_table",
     "whole_file",

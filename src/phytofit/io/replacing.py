@@ -96,6 +96,9 @@ def whole_files(folder: Path, instead_of: Iterable[Path] = ()) -> Iterator[Path]
         _installed(folder) as part,
     ):
         yield part
+        gone = [path.name for path in instead_of if not (part / path.name).exists()]
+        if gone:
+            (part / GONE).write_text("\n".join(gone), encoding="utf-8")
 
 
 @contextmanager

@@ -11,9 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from phytofit.bundled import species_folder, species_names
 from phytofit.errors import InputError, SettingError, SpeciesError
+from phytofit.models.grammar import PlantGrammar
 from phytofit.models.phytomer import N_PAPER, Phytomer
 from phytofit.parameters import Parameter, ParameterSpace
 from phytofit.small_files import read_toml, shortened
+from phytofit.species.plants import PlantSection
 from phytofit.text import one_line
 
 __all__ = ["STEM_ABOVE", "Species", "load_species"]
@@ -29,7 +31,7 @@ class Species:
 
     ``space`` is the prior of the model's parameters; ``ranges`` (k, 2) what a simulation draws from, uniformly;
     ``own_shape_odds`` to one are the odds, before a cloud is seen, that a leaf has a shape of its own, not that of the
-    first six parameters.
+    first six parameters; ``plant``, if the file has it, how whole plants are built.
     """
 
     name: str
@@ -37,6 +39,7 @@ class Species:
     space: ParameterSpace
     ranges: NDArray[np.float64]
     own_shape_odds: float = 100.0
+    plant: PlantGrammar | None = None
 
     def leading(self, n: int) -> "Species":
         """The species with the first `n` of its parameters only: 6 are the paper's."""
@@ -80,6 +83,7 @@ class _File(BaseModel):
     own_shape_odds: Annotated[Number, Field(gt=0)] = 100.0
     constants: _Constants = _Constants()
     parameters: dict[str, _Parameter]
+    plant: PlantSection | None = None
 
 
 def load_species(species: str | Path = "sorghum") -> Species:
@@ -138,4 +142,11 @@ def _assemble(file: _File, where: str) -> Species:
             raise SpeciesError(f"{where}: {error}") from None
         ranges.append(p.range)
     model = Phytomer(**file.constants.model_dump())
-    return Species(one_line(file.name), model, ParameterSpace(parameters), np.array(ranges, float), file.own_shape_odds)
+    return Species(
+        name=one_line(file.name),
+        model=model,
+        space=ParameterSpace(parameters),
+        ranges=np.array(ranges, float),
+        own_shape_odds=file.own_shape_odds,
+        plant=None if file.plant is None else file.plant.grammar(),
+    )
