@@ -45,6 +45,7 @@ SHOWS_ITSELF = {(file, part) for file in RESULTS for part in ("plots", "io")}
 PUBLIC = """
 CAMERAS Agreement Camera CloudError Comparison Fit InputError NoPhytomerError NoStemError OutputError PaperFit
 PhytofitError PlantRun PointCloud Reconstruction Remark Segmentation SegmentedLeaf SettingError SimulatedPhytomer
+SimulatedPlant simulate_plant
 Species SpeciesError Status Trait UnitError agreement compare fit from_points load_camera load_species measure
 read_cloud read_measures read_results recipe reconstruct run save_fit save_reconstruction save_segmentation segment
 separate_plants simulate write_cloud

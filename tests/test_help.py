@@ -19,7 +19,7 @@ from phytofit.parsing import AXES
 from phytofit.pipeline import run
 from phytofit.recipe import defaults
 from phytofit.reconstruct import CAMERAS, reconstruct
-from phytofit.simulation import simulate
+from phytofit.simulation import simulate, simulate_plant
 from phytofit.species import load_species
 
 COMMANDS = ("fit", "run", "segment", "reconstruct", "simulate", "validate", "demo", "recipe")
@@ -98,8 +98,12 @@ def test_help_shows_the_defaults_of_the_functions():
     for name in CAMERAS:
         assert name in help_of("run")
         assert name in help_of("reconstruct")
-    for name in ("n_points", "noise_cm", "sphere_diameter_cm"):
-        assert f"[default: {defaults(simulate)[name]}]" in help_of("simulate")
+    of_simulate = help_of("simulate")
+    for name in ("noise_cm", "sphere_diameter_cm"):
+        assert f"[default: {defaults(simulate)[name]}]" in of_simulate
+    number, of_plants = (defaults(function)["n_points"] for function in (simulate, simulate_plant))
+    assert f"{number}, of plants {of_plants}." in of_simulate
+    assert defaults(simulate)["noise_cm"] == defaults(simulate_plant)["noise_cm"]
 
 
 def test_every_public_name_is_imported_when_it_is_asked_for():
