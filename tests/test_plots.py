@@ -127,7 +127,8 @@ def test_what_is_drawn_as_measured_is_to_scale(fitted):
 
 def test_quality_is_seen_by_mark_and_colour(fitted):
     """Each trait has its mark, a remark that of its grade; their colours differ."""
-    odd = replace(fitted, observed=(remark("two_fits", traits=["leaf_angle"], others="another"), remark("tip_unseen")))
+    unusual = remark("unusual", traits=["leaf_angle"], parameter="leaf_angle", value="170 deg")
+    odd = replace(fitted, observed=(unusual, remark("tip_unseen")))
     words = words_of(phytofit.plots.plot_fit(odd, "leaf"))
     traits = {trait.name: trait.quality for trait in odd.traits}
     assert (traits["leaf_angle"], traits["leaf_length"], traits["stem_diameter"]) == ("poor", "check", "good")
@@ -135,7 +136,7 @@ def test_quality_is_seen_by_mark_and_colour(fitted):
     for quality, (mark, _) in QUALITY.items():
         graded = [one for one in odd.remarks if one.grade == quality]
         assert words.count(mark) == shown.count(quality) + len(graded)
-    assert any("(two_fits)" in word for word in words)
+    assert any("(unusual)" in word for word in words)
     assert len({color for _, color in QUALITY.values()}) == len({mark for mark, _ in QUALITY.values()}) == 3
 
 
