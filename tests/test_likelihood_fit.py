@@ -305,7 +305,7 @@ def beside(result, length_cm, probability):
     """The result, where with some probability its leaf is so much longer."""
     longer = result.x.copy()
     longer[3] += length_cm
-    other = Alternative(probability, result.species.space, longer, result.trait_covariance)
+    other = Alternative(probability, result.species.space, replace(result.estimate, x=longer))
     return replace(result, estimate=replace(result.estimate, alternatives=(other,)))
 
 
@@ -320,6 +320,20 @@ def test_two_solutions_are_told(result):
     assert "stem_diameter" not in one.traits
     assert "two_fits" not in beside_its_rival(beside(result, 10.0, 0.05)).flags
     assert beside_its_rival(beside(result, 0.0, 0.4)).remarks == beside_its_rival(result).remarks == ()
+
+
+@pytest.mark.parametrize("probability", [0.1, 0.6])
+def test_the_same_estimate_again_changes_no_interval(result, probability):
+    """Whatever an interval allows for, that of the other estimate does too: here all that can be allowed for."""
+    made = replace(result.estimate, misfit_cm=0.3, width_misfit=0.05, blunt=True, tip_seen=False, ends_at=0.97)
+    alone = replace(result, estimate=made)
+    both = beside(alone, 0.0, probability)
+    for one, other in zip(alone.traits, both.traits, strict=True):
+        assert other.low == pytest.approx(one.low, rel=1e-9)
+        assert (other.high is None) == (one.high is None)
+        assert one.high is None or other.high == pytest.approx(one.high, rel=1e-9)
+    for name, ends in alone.parameter_intervals.items():
+        assert both.parameter_intervals[name] == pytest.approx(ends, rel=1e-9)
 
 
 @pytest.mark.parametrize("probability", [0.01, 0.3, 0.5])

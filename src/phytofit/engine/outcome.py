@@ -55,16 +55,6 @@ class Choice(NamedTuple):
         return self._replace(optimum=optimum, dependence=dependence, rivals=rivals)
 
 
-class Alternative(NamedTuple):
-    """Another estimate: parameters x (k,) of the model in `space`, with the covariance (k, k) of their error, and how
-    probable it is that it is the right one."""
-
-    probability: float
-    space: ParameterSpace
-    x: FloatArray
-    covariance: FloatArray
-
-
 @dataclass(frozen=True)
 class Estimate:
     """The maximum of the posterior; beside holes, with the leaf's width as its whole pieces have it.
@@ -103,10 +93,18 @@ class Estimate:
     misfit_cm: float
     width_misfit: float
     correlated_cm: float
-    alternatives: tuple[Alternative, ...]
+    alternatives: tuple["Alternative", ...]
     quantile: float
     converged: bool
     sighting: Sighting
+
+
+class Alternative(NamedTuple):
+    """Another estimate, of the parameters in `space`, and how probable it is that it is the right one."""
+
+    probability: float
+    space: ParameterSpace
+    estimate: Estimate
 
 
 def outcome(chosen: Choice) -> Estimate:
@@ -149,18 +147,14 @@ def outcome(chosen: Choice) -> Estimate:
 
 
 def _alternatives(chosen: Choice) -> tuple[Alternative, ...]:
-    """The rivals that are not out of the question, and how probable they are."""
+    """What the cloud says of the rivals that are not out of the question, and how probable they are."""
     leads = np.array([0.0, *(rival.lead for rival in chosen.rivals)])
     found = []
-    for rival, p in zip(chosen.rivals, softmax(leads)[1:].tolist(), strict=True):
-        if p < LEAST_PROBABLE:
-            continue
-        posterior, state, at = rival.optimum.posterior, rival.optimum.state, rival.optimum.at
-        k = len(state.x)
-        dependence = score_dependence(posterior, state, chosen.dependence)
-        covariance = covariance_of(posterior, state, at, dependence)[0][:k, :k]
-        covariance += np.diag(posterior.space.discrepancy_at(state.x) ** 2)
-        found.append(Alternative(p, posterior.space, state.x, covariance))
+    for (optimum, _), p in zip(chosen.rivals, softmax(leads)[1:].tolist(), strict=True):
+        if p >= LEAST_PROBABLE:
+            dependence = score_dependence(optimum.posterior, optimum.state, chosen.dependence)
+            estimate = outcome(Choice(optimum, dependence, chosen.tip_doubtful, chosen.blunt))
+            found.append(Alternative(p, optimum.posterior.space, estimate))
     return tuple(found)
 
 

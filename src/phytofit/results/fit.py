@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -45,9 +45,9 @@ class Fit(FittedPhytomer):
         space, quantile = self.species.space, self.estimate.quantile
         half = quantile * np.sqrt(np.diag(self.covariance))
         others = [
-            (it.probability, it.x - self.x, Ends(*[quantile * np.sqrt(np.diag(it.covariance))] * 2))
-            for it in self.estimate.alternatives
-            if it.space.names == space.names
+            (p, other.x - self.x, Ends(*[quantile * np.sqrt(np.diag(other.covariance))] * 2))
+            for p, other in self._alternatives
+            if other.species.space.names == space.names
         ]
         ends = Ends(half, half).mixed(others, quantile)
         low = self._in_units(np.minimum(np.maximum(self.x - ends.below, space.lower), self.x)).tolist()
@@ -99,14 +99,17 @@ class Fit(FittedPhytomer):
 
     def _turned_alternatives(self) -> Iterator[Alternative]:
         for it in self.estimate.alternatives:
-            found = self.species.model.upside_down(it.x)
+            made = it.estimate
+            found = self.species.model.upside_down(made.x)
             if found is not None:
                 turn, offset, _ = found
-                yield it._replace(x=turn @ it.x + offset, covariance=turn @ it.covariance @ turn.T)
+                covariance, of_traits = (turn @ each @ turn.T for each in (made.covariance, made.trait_covariance))
+                x = turn @ made.x + offset
+                yield it._replace(estimate=replace(made, x=x, covariance=covariance, trait_covariance=of_traits))
 
-    def _organs_of(self, x: FloatArray, *, whole: bool = False) -> tuple[Organ, ...]:
+    def _organs_of(self, x: FloatArray) -> tuple[Organ, ...]:
         stem, leaf = self._scaled_organs(x)
-        return stem, leaf if whole else leaf.until(self.estimate.ends_at)
+        return stem, leaf.until(self.estimate.ends_at)
 
     def _with_intervals(self) -> list[Trait]:
         traits, ends = self._measured(self.x), self._ends()
@@ -140,7 +143,7 @@ class Fit(FittedPhytomer):
 
     def _ends(self) -> Ends:
         """How far the traits' intervals reach, as it may be this estimate that is right or another."""
-        return self._own_ends.mixed(self._alternatives, self.estimate.quantile)
+        return self._own_ends.mixed(self._apart, self.estimate.quantile)
 
     @cached_property
     def _own_ends(self) -> Ends:
@@ -165,15 +168,28 @@ class Fit(FittedPhytomer):
         return ends.with_error(by_width, by_width + by_stem)
 
     @cached_property
-    def _alternatives(self) -> list[tuple[float, FloatArray, Ends]]:
+    def _alternatives(self) -> list[tuple[float, "Fit"]]:
+        """What this fit would say were another estimate the right one, and how probable that is."""
+        return [
+            (
+                it.probability,
+                replace(
+                    self,
+                    species=replace(self.species, space=it.space),
+                    x=it.estimate.x,
+                    covariance=it.estimate.covariance,
+                    trait_covariance=it.estimate.trait_covariance,
+                    estimate=it.estimate,
+                ),
+            )
+            for it in self.estimate.alternatives
+        ]
+
+    @cached_property
+    def _apart(self) -> list[tuple[float, FloatArray, Ends]]:
         """How probable other estimates are, how far (t,) from this one their traits lie, and how far these reach."""
-        made, values = self.estimate, self._values(self.x)
-        whole = partial(self._values, whole=True)
-        found = []
-        for p, space, x, covariance in made.alternatives:
-            ends = propagated(whole, x, covariance, made.quantile, *_within(space))
-            found.append((p, whole(x) - values, ends))
-        return found
+        values = self._values(self.x)
+        return [(p, other._values(other.x) - values, other._own_ends) for p, other in self._alternatives]
 
     @property
     def beside_alternatives(self) -> dict[str, float]:
@@ -183,7 +199,7 @@ class Fit(FittedPhytomer):
         if not self.estimate.alternatives:
             return found
         own, names = self._own_ends, [trait.name for trait in self._measured(self.x)]
-        for p, apart, _ in self._alternatives:
+        for p, apart, _ in self._apart:
             if p < ABOUT_AS_PROBABLE:
                 continue
             beyond = np.isfinite(apart) & ((apart > own.above) | (apart < -own.below))
@@ -197,9 +213,9 @@ class Fit(FittedPhytomer):
         least = np.arctan2(off, self.parameters["stem_length"])  # at which that is all of the stem below it
         return float(off / np.tan(max(np.deg2rad(angle), least))) if off > 0.0 and angle < 90.0 else 0.0
 
-    def _values(self, x: FloatArray, *, thicker: float = 0.0, whole: bool = False) -> FloatArray:
-        """Values (t,) of the traits, of a stem with a radius so much larger, of the leaf as it ends, or `whole`."""
-        stem, leaf = self._organs_of(x, whole=whole)
+    def _values(self, x: FloatArray, *, thicker: float = 0.0) -> FloatArray:
+        """Values (t,) of the traits, of a stem with a radius so much larger."""
+        stem, leaf = self._organs_of(x)
         stem = replace(stem, half_width=np.maximum(stem.half_width + thicker, 0.0))
         return np.array([trait.value for trait in measure((stem, leaf), chord_cm=self._chord_cm)])
 
