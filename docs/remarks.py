@@ -19,17 +19,17 @@ Each trait has a *quality*, in the table's column `quality`, on the screen, on `
 | `poor` | ✖ | do not use it |
 | empty | | nothing is known: there is no interval, as with `--method paper`, or from the segmentation |
 
-A trait's quality is the worst that its interval and the remarks that touch it allow. The column `flags` has the codes
-of these remarks, with `;` between them. To keep what is good in R or pandas, filter by `quality`.
-The screen, `fit.json` and the pictures say each remark in full, with what to do.
+A trait's quality is the worst grade given by its interval or by any remark on it. The column `flags` has the codes
+of these remarks, with `;` between them. In R or pandas, filter on `quality`.
+The screen, `fit.json` and the pictures give each remark in full, with its remedy.
 
 A good trait can still be wrong: look at the picture.
-[How accurate, how robust, how fast](accuracy.md#quality) says how large the errors are of each quality.
+[How accurate, how robust, how fast](accuracy.md#quality) gives the errors at each quality.
 
 ## Intervals
 
-Half of an interval that is wider than this makes a trait `check` or `poor`. Where one end is open, the closed one
-counts.
+A trait is `check` or `poor` if half the width of its interval exceeds these limits. If one end is open, the distance
+to the other end counts.
 
 | trait | `check` | `poor` |
 |---|---|---|

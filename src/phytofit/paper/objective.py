@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +14,16 @@ from phytofit.errors import SettingError
 from phytofit.kernels.icp import MAX_MEMORY, icp, transform
 from phytofit.models import Phytomer, SurfaceSampler
 from phytofit.models.organs import PopulationSurfaces
-from phytofit.paper.cross_entropy import CrossEntropy, Generation
 from phytofit.paper.distances import Distance, Reference, hausdorff
 
-__all__ = ["PaperObjective", "Registration", "minimise"]
+__all__ = ["Optimiser", "PaperObjective", "Registration", "minimise"]
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 OrganArray = NDArray[np.int8]
 _Round = tuple[int, tuple[int, float, int]]  # every how many-th point; iterations, tolerance, memory
 BLOCK = 10  # candidates that a thread takes at a time
+SearchT = TypeVar("SearchT", bound="Optimiser")
 SHORTLIST = 2  # times the elite's size: so many candidates go on to the fine round
 
 
@@ -192,12 +192,32 @@ class PaperObjective:
         return Registration(aligned, float(np.sqrt(mse)), int(iterations), bool(converged))
 
 
+class Optimiser(Protocol):
+    """What searches: :class:`CrossEntropy`, or another."""
+
+    @property
+    def done(self) -> bool:
+        """Whether the search is over."""
+
+    @property
+    def n_elite(self) -> int | None:
+        """How many of the smallest errors it uses; None if it needs all."""
+
+    def ask(self) -> FloatArray:
+        """Candidates (n, k)."""
+
+    def tell(self, xs: FloatArray, errors: FloatArray) -> Any:
+        """Take the errors (n,) of candidates (n, k), inf of some that are not of the elite; what it returns goes to
+        `progress`."""
+
+
 def minimise(
-    search: CrossEntropy,
-    objective: Callable[[FloatArray, int], FloatArray],
-    progress: Callable[[Generation], None] | None = None,
-) -> CrossEntropy:
-    """Run the search to its end on ``objective(xs (n, k), n_elite) -> errors (n,)`` and return it."""
+    search: SearchT,
+    objective: Callable[[FloatArray, int | None], FloatArray],
+    progress: Callable[[Any], None] | None = None,
+) -> SearchT:
+    """Run the search to its end on ``objective(xs (n, k), n_elite) -> errors (n,)`` and return it, with
+    `progress` called after each generation."""
     while not search.done:
         xs = search.ask()
         generation = search.tell(xs, objective(xs, search.n_elite))

@@ -83,7 +83,7 @@ KINDS = {
         CHECK,
         "the leaf's tip is missing: the leaf may be longer",
         "Scan the tip",
-        "The leaf stops while it is still wide, and a leaf that goes on explains the points clearly better. The "
+        "The leaf is still wide where its points end, and a longer leaf explains them clearly better. The "
         "intervals of length and area have no upper end.",
     ),
     "tip_doubtful": Kind(
@@ -99,7 +99,7 @@ KINDS = {
         CHECK,
         "the leaf ends bluntly, as if its tip were cut off: length and area are those of the part that was seen",
         "Look at the tip in fit.png",
-        "The leaf stops while it is still wide, but its shape says little about what is missing.",
+        "The leaf is still wide where its points end, but its shape says little about what is missing.",
     ),
     "tip_cut_back": Kind(
         LENGTHS,
@@ -115,7 +115,7 @@ KINDS = {
         CHECK,
         "{n} points lie beyond the fitted tip: the leaf may be longer",
         "Look at the tip in fit.png",
-        "Clearly more points than stray ones lie beyond the tip: it bends away sharply, or something touches it. The "
+        "More points lie beyond the tip than stray points explain: it bends away sharply, or something touches it. The "
         "intervals of length and area have no upper end.",
         "points lie beyond the fitted tip: the leaf may be longer",
     ),
@@ -148,7 +148,7 @@ KINDS = {
         CHECK,
         "only {n} points on the leaf: its length tends to come out too short",
         "Scan more densely",
-        "Fewer than 200 points on a leaf that is bent or shaped in its own way.",
+        "The leaf needs the richer model but has fewer than 200 points.",
         "few points on the leaf: its length tends to come out too short",
     ),
     "base_hidden": Kind(
@@ -188,7 +188,7 @@ KINDS = {
         CHECK,
         "the stem's points scatter by half its radius or more: if its section is filled with points, it is thicker",
         "Look at the stem in fit.png",
-        "In so much noise a hollow tube and a filled stem look alike. A filled one comes out too thin.",
+        "With this much noise, a hollow and a filled stem look alike. A filled one comes out too thin.",
     ),
     "stem_ends_elsewhere": Kind(
         ("stem_length", *ANGLES),
@@ -196,8 +196,8 @@ KINDS = {
         "the stem goes on {above} above the leaf and {below} below it: stem_above={better!r} may fit better than "
         "{how!r}",
         "Fit again with it",
-        "The stem was stated to end at the leaf, or to be as long above it as below (`--stem-above`); this cloud's is "
-        "not.",
+        "`--stem-above` states that the stem ends at the leaf, or is as long above it as below. In this cloud it is "
+        "not so.",
     ),
     # the whole
     "two_fits": Kind(
@@ -215,14 +215,14 @@ KINDS = {
         CHECK,
         "the fit did not converge",
         "Look at fit.png, or try another seed",
-        "The refinement stopped before it came to rest.",
+        "The refinement stopped before it converged.",
     ),
     "search_split": Kind(
         (*STEM, *LEAF),
         CHECK,
         "the search did not converge: its last best candidates differ",
         "Use more generations or samples, or another seed",
-        "With `--method paper`: what lies between the best candidates fits worse than they do.",
+        "With `--method paper`: the best candidates lie in separate optima; their mean fits worse than they do.",
     ),
     "points_unexplained": Kind(
         (*STEM, *LEAF),
@@ -301,7 +301,7 @@ KINDS = {
         CHECK,
         "wide intervals: {named}",
         "Use them with their intervals",
-        "The cloud says little about these traits. Their intervals are wide, which is not to say wrong.",
+        "The cloud says little about these traits. Their intervals are wide, but not necessarily wrong.",
         "some intervals are wide: see the column quality of the tables",
     ),
     "interval_useless": Kind(

@@ -27,8 +27,8 @@ MOST_CM = 10_000.0
 @dataclass(frozen=True)
 class SimulatedPlant:
     """A cloud with its truth: ``points`` (n, 3) cm; ``labels`` (n,) 1 stem and tassel, rank + 1 a leaf, 0 outlier;
-    ``plant`` as the grammar writes it; ``organs`` in the cloud's frame; ``pose`` (4, 4) from the plant's, whose stem
-    stands in the origin with +z up, to the cloud's."""
+    ``plant`` as the grammar writes it; ``organs`` in the cloud's frame; ``pose`` (4, 4) from the plant's frame
+    (the foot of the stem at the origin, +z up) to the cloud's."""
 
     points: FloatArray
     labels: NDArray[np.int64]

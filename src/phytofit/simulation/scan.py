@@ -22,8 +22,8 @@ OUTLIER_MARGIN = 0.25  # outliers fill the cloud's box, grown by this share of i
 def seen_from(
     organs: Sequence[Organ], n_points: int, n_views: int | None, random: np.random.Generator
 ) -> tuple[FloatArray, NDArray[np.int64]]:
-    """So many points (n, 3) that are drawn evenly from the organs, or of those that cameras see, evenly spaced around
-    the plant and looking down on it by `CAMERA_ABOVE_DEG`; and the number (n,) of each point's organ."""
+    """Points (n, 3) drawn uniformly from the organs, and the index (n,) of each point's organ.  With `n_views`, only
+    points that some camera sees; the cameras stand evenly around the plant, `CAMERA_ABOVE_DEG` above the horizon."""
     n_drawn = n_points if n_views is None else SPARE * n_points
     points, organ = SurfaceSampler(n_drawn, int(random.integers(2**31)), even=False).draw(organs)
     shuffle = random.permutation(n_drawn)  # a sensor's points come in no order of the model's
