@@ -232,7 +232,7 @@ def test_a_species_without_a_grammar_draws_no_plants():
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ('unit = "deg"\nmean = 180.0', 'unit = "rad"\nmean = 180.0', "expected 'deg'"),
+        ('unit = "deg"\nmean = 180.0', 'unit = "rad"\nmean = 180.0', "be 'deg'"),
         ("[plant.profiles.leaf_bend]", "[plant.profiles.leaf_bent]", "leaf_bend"),
         ("least = 4", "least = 40", "least <= mean <= most"),
         ("rolled_leaves = 2", "rolled_leaves = -2", "rolled_leaves"),

@@ -1,6 +1,5 @@
 """Simulated phytomers: true organs to a cloud, with noise, removed spheres, outliers and a random pose."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
@@ -11,13 +10,12 @@ from numpy.typing import NDArray
 from phytofit.errors import SettingError
 from phytofit.models import Organ, move
 from phytofit.parsing import checked_number, checked_whole
-from phytofit.simulation.scan import add_noise, add_outliers, occlude, random_pose, seen_from
+from phytofit.simulation.scan import MOST_CM, add_noise, anywhere, check_scan, occlude, seen_from
 from phytofit.species import Species, load_species
 
 __all__ = ["SimulatedPhytomer", "simulate"]
 
 FloatArray = NDArray[np.float64]
-MOST_CM = 10_000.0  # of any length of a phytomer; a plant is no longer than 100 m
 ABOVE = "stem_length_above"
 
 
@@ -58,19 +56,10 @@ def simulate(
     spaced around the stem and looking down on it by `CAMERA_ABOVE_DEG`; None: from everywhere.
     """
     species = load_species() if species is None else species
-    for name, count, least in (
-        ("points", n_points, 1),
-        ("views", 1 if n_views is None else n_views, 1),
-        ("spheres", n_spheres, 0),
-    ):
-        checked_whole(name, count, least)
-    checked_whole("seed", seed, 0, math.inf)
-    for name, length in (("noise", noise_cm), ("noise reach", noise_reach_cm), ("sphere diameter", sphere_diameter_cm)):
-        checked_number(name, length, most=MOST_CM)
-    if not sphere_diameter_cm > 0:
+    check_scan(n_points, noise_cm, noise_reach_cm, n_views, outlier_share, seed)
+    checked_whole("spheres", n_spheres, 0)
+    if not checked_number("sphere diameter", sphere_diameter_cm, most=MOST_CM) > 0:
         raise SettingError(f"sphere diameter: expected a positive number of cm, got {sphere_diameter_cm:g}")
-    if not checked_number("outliers", outlier_share) < 1:
-        raise SettingError(f"outliers: expected a share from 0 to below 1, got {outlier_share:g}")
     random = np.random.default_rng(seed)
     space = species.space
     low, high = species.ranges.T
@@ -102,9 +91,5 @@ def simulate(
                 f"spheres: expected to leave some of the {n_points} points, but "
                 f"{n_spheres} of {sphere_diameter_cm:g} cm remove all"
             )
-    outliers = add_outliers(points, outlier_share, random)
-    points = np.concatenate([points, outliers])
-    labels = np.concatenate([labels, np.zeros(len(outliers), np.int64)])
-    pose = random_pose(random) if random_orientation else np.eye(4)
-    points = points @ pose[:3, :3].T + pose[:3, 3]
+    points, labels, pose = anywhere(points, labels, outlier_share, random, turned=random_orientation)
     return SimulatedPhytomer(points, labels, x, move(organs, pose), pose)

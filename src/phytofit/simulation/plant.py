@@ -1,6 +1,5 @@
 """Simulated whole plants: drawn from a species' grammar, and scanned."""
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,8 +9,8 @@ from phytofit.errors import SettingError
 from phytofit.models import LEAF, Organ, move
 from phytofit.models.grammar import Plant
 from phytofit.models.plant import PlantOrgan, plant_organs
-from phytofit.parsing import checked_number, checked_whole
-from phytofit.simulation.scan import add_noise, add_outliers, random_pose, seen_from
+from phytofit.parsing import checked_whole
+from phytofit.simulation.scan import add_noise, anywhere, check_scan, seen_from
 from phytofit.species import Species, load_species
 from phytofit.traits import Trait, measure
 
@@ -21,7 +20,6 @@ FloatArray = NDArray[np.float64]
 N_SHAPE = 7  # parameters of a leaf's model before those of what real leaves do beyond the paper's
 OF_STEM = ("collar_offset", "stem_diameter_above", "stem_taper")  # of a leaf's parameters: the plant has its own
 LEAN_DEG = 5.0  # standard deviation of the stem's turn from foot to top, each way
-MOST_CM = 10_000.0
 
 
 @dataclass(frozen=True)
@@ -107,15 +105,10 @@ def simulate_plant(
         raise SettingError(
             f"species {species.name}: expected a file with a section [plant], which says how plants grow"
         )
-    counts = (("points", n_points), ("views", n_views), ("leaves", n_leaves), ("unfolded leaves", n_collars))
-    for name, count in counts:
+    check_scan(n_points, noise_cm, noise_reach_cm, n_views, outlier_share, seed)
+    for name, count in (("leaves", n_leaves), ("unfolded leaves", n_collars)):
         if count is not None:
             checked_whole(name, count, 1)
-    checked_whole("seed", seed, 0, math.inf)
-    for name, length in (("noise", noise_cm), ("noise reach", noise_reach_cm)):
-        checked_number(name, length, most=MOST_CM)
-    if not checked_number("outliers", outlier_share) < 1:
-        raise SettingError(f"outliers: expected a share from 0 to below 1, got {outlier_share:g}")
     random = np.random.default_rng(seed)
     plant = species.plant.draw(random, n_leaves=n_leaves, n_collars=n_collars)
     shapes = {symbol.rank: _shape(species, random) for symbol in plant.of("blade")}
@@ -124,11 +117,7 @@ def simulate_plant(
     points, which = seen_from([it.organ for it in found], n_points, n_views, random)
     labels = np.array([it.rank + 1 for it in found])[which]
     points = add_noise(points, noise_cm, random, noise_reach_cm)
-    outliers = add_outliers(points, outlier_share, random)
-    points = np.concatenate([points, outliers])
-    labels = np.concatenate([labels, np.zeros(len(outliers), np.int64)])
-    pose = random_pose(random) if random_orientation else np.eye(4)
-    points = points @ pose[:3, :3].T + pose[:3, 3]
+    points, labels, pose = anywhere(points, labels, outlier_share, random, turned=random_orientation)
     moved: tuple[Organ, ...] = move([it.organ for it in found], pose)
     organs = tuple(replace(it, organ=organ) for it, organ in zip(found, moved, strict=True))
     return SimulatedPlant(points, labels, plant, organs, pose)

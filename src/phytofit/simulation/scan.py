@@ -1,22 +1,49 @@
 """What a scan does to the points of true organs: noise, sides that no camera sees, holes, outliers, any pose."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from phytofit.errors import SettingError
 from phytofit.models import Organ, SurfaceSampler
+from phytofit.parsing import checked_number, checked_whole
 
-__all__ = ["add_noise", "add_outliers", "occlude", "random_pose", "seen_from", "visible"]
+__all__ = [
+    "MOST_CM",
+    "add_noise",
+    "add_outliers",
+    "anywhere",
+    "check_scan",
+    "occlude",
+    "random_pose",
+    "seen_from",
+    "visible",
+]
 
 FloatArray = NDArray[np.float64]
+MOST_CM = 10_000.0  # of any length; a plant is no longer than 100 m
 CAMERA_ABOVE_DEG = 20.0  # the cameras of `n_views` are so much above the horizon
 SPARE = 8  # times as many points are drawn as cameras are to see
 SCREEN_POINTS, PIXEL_CM = 250_000, 0.1  # of the depth buffer; some five points a pixel
 BEHIND_CM = 0.4  # so far behind the nearest point of its pixel a point is still of the same surface, seen at a slant
 AT_ONCE = 1000  # points, whose neighbours are listed
 OUTLIER_MARGIN = 0.25  # outliers fill the cloud's box, grown by this share of its size
+
+
+def check_scan(
+    n_points: int, noise_cm: float, noise_reach_cm: float, n_views: int | None, outlier_share: float, seed: int
+) -> None:
+    """SettingError for numbers that no scan can have."""
+    checked_whole("points", n_points, 1)
+    checked_whole("views", 1 if n_views is None else n_views, 1)
+    checked_whole("seed", seed, 0, math.inf)
+    for name, length in (("noise", noise_cm), ("noise reach", noise_reach_cm)):
+        checked_number(name, length, most=MOST_CM)
+    if not checked_number("outliers", outlier_share) < 1:
+        raise SettingError(f"outliers: expected a share from 0 to below 1, got {outlier_share:g}")
 
 
 def seen_from(
@@ -79,6 +106,16 @@ def add_outliers(points: FloatArray, share: float, random: np.random.Generator) 
     low, high = points.min(axis=0), points.max(axis=0)
     margin = OUTLIER_MARGIN * (high - low)
     return random.uniform(low - margin, high + margin, (round(share * len(points)), 3))
+
+
+def anywhere(
+    points: FloatArray, labels: NDArray[np.int64], outlier_share: float, random: np.random.Generator, *, turned: bool
+) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:
+    """Points and labels with outliers, labelled 0, and their pose (4, 4): random if `turned`, else where they are."""
+    outliers = add_outliers(points, outlier_share, random)
+    labels = np.concatenate([labels, np.zeros(len(outliers), np.int64)])
+    pose = random_pose(random) if turned else np.eye(4)
+    return np.concatenate([points, outliers]) @ pose[:3, :3].T + pose[:3, 3], labels, pose
 
 
 def random_pose(random: np.random.Generator, reach_cm: float = 50.0) -> FloatArray:

@@ -1,6 +1,6 @@
 """The ``[plant]`` section of a species file: how whole plants of the species are built."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -31,26 +31,16 @@ class _Leaves(_Section):
 
 
 class _Divergence(_Section):
-    unit: str
+    unit: Literal["deg"]
     mean: Annotated[float, Field(strict=True, ge=0.0, le=360.0)]
     std: Positive
 
-    @field_validator("unit")
-    @classmethod
-    def _in_degrees(cls, unit: str) -> str:
-        return _checked_unit(unit, "deg")
-
 
 class _Tassel(_Section):
-    unit: str
+    unit: Literal["cm"]
     odds: Number
     branches: Count
     branch_length: Positive
-
-    @field_validator("unit")
-    @classmethod
-    def _in_cm(cls, unit: str) -> str:
-        return _checked_unit(unit, "cm")
 
 
 class _Profile(_Section):
@@ -78,10 +68,8 @@ class PlantSection(_Section):
         if set(profiles) != set(PROFILES):
             raise ValueError(f"expected {', '.join(PROFILES)}, no more and no less")
         for name, profile in profiles.items():
-            try:
-                _checked_unit(profile.unit, PROFILES[name])
-            except ValueError as error:
-                raise ValueError(f"{name}: {error}") from None
+            if profile.unit != PROFILES[name]:
+                raise ValueError(f"{name}: unit: expected {PROFILES[name]!r}, got {profile.unit!r}")
         return profiles
 
     def grammar(self) -> PlantGrammar:
@@ -103,9 +91,3 @@ class PlantSection(_Section):
             profiles={name: Profile(**p.model_dump(exclude={"unit"})) for name, p in self.profiles.items()},
             **tassel,
         )
-
-
-def _checked_unit(found: str, expected: str) -> str:
-    if found != expected:
-        raise ValueError(f"unit: expected {expected!r}, got {found!r}")
-    return found
